@@ -50,6 +50,15 @@ def problem(stiffer: float, shape=(5, 5)) -> Problem:
     return Problem.make(lift_of(stiffer), SPACE, shape=shape, nuisance_prior=EXACT)
 
 
+def end_at(theta, loss: Any = 0.0, gradient: Any = 0.0, matrix: Any = 0.0, scale=0.0) -> Descent:
+    """The end of a descent, in the first stage."""
+    zero, theta = jnp.zeros(()), jnp.asarray(theta, float)
+    square = jnp.zeros((len(theta), len(theta)))
+    gradient, matrix = jnp.zeros(len(theta)) + gradient, square + matrix
+    normal = Normal(jnp.asarray(loss, float), zero, zero, gradient, matrix, square)
+    return Descent(theta, normal, zero, zero, jnp.asarray(scale, float), jnp.zeros((), int))
+
+
 def valley(lifted, size):
     """The end of a descent in a quadratic loss, and what the loss is at any place."""
     random = np.random.default_rng(0)

@@ -2,11 +2,11 @@
 
 In reading order:
 
-- `method`, `methods`, `baselines`: the contract `Method.estimate`, and all `METHODS`.
+- `method`, `methods`: the contract `Method.estimate`, and all `METHODS`.
 - `estimate`, `cards`, `checkpoint`: results and their files.
 - `problem`, `prediction`: a recording to be explained; what it would show of a fabric.
 - `normal_equations`, `least_squares`, `gauss_newton`, `descent`: the loss, steps, whole descents.
-- `standard_errors`, `mesh_bias`, `consistency`, `judgement`: how well the end is known.
+- `standard_errors`, `consistency`, `judgement`: standard errors and checks of the end.
 - `mesh_refinement`: from a coarse mesh to one that resolves the fabric.
 - `held_out`: a test on a recording that was not used.
 - `physnet`, `pinn`: the methods that train networks.

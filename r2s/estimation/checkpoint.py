@@ -1,4 +1,4 @@
-"""Checkpoints: arrays and a description of their run in one NPZ, from which a killed run goes on.
+"""Checkpoints: arrays and a description of their run in one NPZ, from which a killed run resumes.
 
 run = {"kind": "descent", "run": fingerprint(problem, key)}
 save(path, {"theta": theta}, run)
@@ -40,7 +40,7 @@ def save(path: Path | str, arrays: Mapping[str, Any], run: Mapping[str, Any]) ->
 def read(path: Path | str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays that `save` wrote, and the description of their run.
 
-    Raises `FileNotFoundError`, or `ValueError` that names the file when it is no checkpoint.
+    Raises `FileNotFoundError`, or `ValueError` that names the file if it is no checkpoint.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -63,19 +63,19 @@ def load(path: Path | str, run: Mapping[str, Any]) -> dict[str, np.ndarray] | No
     """
     if not Path(path).exists():
         return None
-    arrays, found = read(path)
+    arrays, stored = read(path)
     asked = json.loads(json.dumps(dict(run)))  # tuples become lists
-    if found != asked:
-        names = [key for key in {**found, **asked} if found.get(key) != asked.get(key)]
-        told = ", ".join(f"{key} {found.get(key)} there, {asked.get(key)} asked" for key in names)
-        raise ValueError(f"{path} is of another run ({told}): remove it, or choose another file")
+    keys = [key for key in {**stored, **asked} if stored.get(key) != asked.get(key)]
+    if keys:
+        pairs = ", ".join(f"{key} {stored.get(key)} there, {asked.get(key)} asked" for key in keys)
+        raise ValueError(f"{path} is of another run ({pairs}): remove it, or choose another file")
     return arrays
 
 
 def forget(path: Path) -> None:
     """Remove a state file, and those of later stages, which have a longer name."""
-    for each in (path, *path.parent.glob(f"{escape(path.stem)}.*{path.suffix}")):
-        each.unlink(missing_ok=True)
+    for file in (path, *path.parent.glob(f"{escape(path.stem)}.*{path.suffix}")):
+        file.unlink(missing_ok=True)
 
 
 def fingerprint(*parts: Any) -> str:
@@ -85,7 +85,9 @@ def fingerprint(*parts: Any) -> str:
         leaves, tree = jax.tree.flatten(part)
         digest.update(repr(tree).encode())
         for leaf in leaves:
-            leaf = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+            if hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+                leaf = jax.random.key_data(leaf)
+            leaf = np.asarray(leaf)
             digest.update(f"{leaf.shape} {leaf.dtype}".encode())
             digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()
@@ -107,7 +109,3 @@ def tree_from(arrays: Mapping[str, np.ndarray], like: T) -> T:
     if missing := [name for name in names if name not in arrays]:
         raise ValueError(f"the checkpoint lacks {', '.join(missing)}")
     return jax.tree.unflatten(tree, [jnp.asarray(arrays[name]) for name in names])
-
-
-def _is_key(leaf: Any) -> bool:
-    return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)

@@ -1,6 +1,6 @@
 """The default parameter spaces, and the origin of their ranges and fixed values.
 
-None is laid around a fabric that is to be estimated. The middle of a range is the start of a search
+None is centred on a fabric that is to be estimated. The middle of a range is the start of a search
 and the value of a parameter that a motion does not determine.
 """
 
@@ -59,21 +59,20 @@ def with_law(space: ParameterSpace, law: Law) -> ParameterSpace:
 
 
 def law_told_by(recordings: Sequence[Recording]) -> Law:
-    """The law that some recordings of one fabric identify: stiffening and softening where the force
-    of a pull was recorded and another motion, since a pull determines how yarns stiffen and a fold
-    bending. Else constant stiffness."""
-    pulled = [each.info.scenario == "stretching" for each in recordings]
-    has_force = any(
-        pull and each.force is not None for pull, each in zip(pulled, recordings, strict=True)
-    )
-    return "stiffening+softening" if has_force and not all(pulled) else "linear"
+    """The law that some recordings of one fabric identify: stiffening and softening from another
+    motion and a pull with its force, since a pull determines how yarns stiffen and a fold bending.
+    Else constant stiffness."""
+    pulls = [recording for recording in recordings if recording.info.scenario == "stretching"]
+    has_force = any(pull.force is not None for pull in pulls)
+    return "stiffening+softening" if has_force and len(pulls) < len(recordings) else "linear"
 
 
 def law_of(ranges: Sequence[Range]) -> Law:
     """The law of a space's parameters, or of an estimate's, by their names."""
-    if SOFTENING[0].name in {each.name for each in ranges}:
-        return "stiffening+softening" if stiffens(ranges) else "softening"
-    return "stiffening" if stiffens(ranges) else "linear"
+    softens = SOFTENING[0].name in {bound.name for bound in ranges}
+    if stiffens(ranges):
+        return "stiffening+softening" if softens else "stiffening"
+    return "softening" if softens else "linear"
 
 
 class Fixed(NamedTuple):
@@ -115,27 +114,23 @@ def fixed(space: ParameterSpace) -> tuple[Fixed, ...]:
     if not isinstance(space, OrthotropicSpace | IsotropicSpace):
         raise TypeError(f"a default space is orthotropic or isotropic, got {type(space).__name__}")
     middle = space.middle()
-    found = [
+    shared = [
         Fixed("density", "kg/m^2", float(space.density), "weighed"),
         Fixed("thickness of contact", "m", float(space.thickness), "convention"),
         Fixed("mass damping", "1/s", float(middle.mass_damping), "none: the air brakes"),
     ]
     if isinstance(space, OrthotropicSpace):
         ratio = float(middle.bending.poissons_ratio)
-        return (*found, Fixed("Poisson's ratio of bending", "-", ratio, "convention"))
+        return (*shared, Fixed("Poisson's ratio of bending", "-", ratio, "convention"))
     plate = "bends as the prior's median of such a weight, in the middle of the range"
-    return (
-        *found,
-        Fixed("plate thickness", "m", float(space.plate), plate),
-        *_losses(space),
-        Fixed("anisotropy", "-", 0.0, "the space has none"),
-    )
-
-
-def _losses(space: IsotropicSpace) -> tuple[Fixed, ...]:
-    given = (
+    losses = (
         Fixed("damping", "s", float(space.damping), "the prior's median"),
         Fixed("friction", "-", float(space.friction), "the prior's median"),
     )
-    estimated = {each.name for each in space.ranges}
-    return tuple(each for each in given if each.name not in estimated)
+    estimated = {bound.name for bound in space.ranges}
+    return (
+        *shared,
+        Fixed("plate thickness", "m", float(space.plate), plate),
+        *(loss for loss in losses if loss.name not in estimated),
+        Fixed("anisotropy", "-", 0.0, "the space has none"),
+    )

@@ -1,11 +1,12 @@
-"""The result of an estimator: a fabric, its standard errors, how it was found; and its JSON object.
+"""The result of an estimator: a fabric, its standard errors, its search; and its JSON object.
 
 Estimates of versions 0.2.0 and 0.3.0 are read, too.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ class Contradiction(NamedTuple):
     """A recording that contradicts the others, see `r2s.estimation.consistency`.
 
     - `recording`: its index; of two the second, which may be the right one.
-    - `parameter`: in which they are the most standard errors apart, `errors`, [-].
+    - `parameter`: that with the largest difference, of so many standard `errors`, [-].
     - `values`: of that parameter, by this recording and by the others, in its unit.
     """
 
@@ -48,19 +49,19 @@ class Contradiction(NamedTuple):
     values: tuple[float, float]
 
 
-UNLIKELY = 1e-4  # that recordings of one fabric lead so far apart by chance
+UNLIKELY = 1e-4  # p-value below which recordings are not of one fabric
 
 
 class Agreement(NamedTuple):
     """Whether the recordings of an estimate are of one fabric, see `r2s.estimation.consistency`.
 
     - `p`: p-value of their scatter, were they of one fabric, [-].
-    - `told`: of each recording, how many directions of the fabric's space it determines beyond the
-      prior and the error of its mesh: with none it was not compared.
+    - `told`: number of directions of the fabric's space that each recording determines beyond the
+      prior and the error of its mesh: without any it was not compared.
     - `contradiction`: the one that contradicts the others; None where all agree.
     - `density`: with which they would agree best, relative to the given one, [-], and the standard
       error of its logarithm; None: that was not estimated.
-    - `exact`: as `p`, were their meshes without error; None where there was no such error.
+    - `exact`: as `p`, without the errors of their meshes; None where these are not estimated.
     """
 
     p: float
@@ -141,8 +142,8 @@ class Estimate:
       errors, which include it; None: not estimated.
     - `shape`: vertices of the simulated sheet along warp and weft; None: unknown.
     - `refused`: a finer mesh that the fabric needs, and why it was not used; or "".
-    - `misfits`: what of the recordings does not fit. `fits`: how far each is from the estimate's
-      motion; empty where that was not judged.
+    - `misfits`: observations that do not fit. `fits`: distance of each recording from the
+      estimate's motion; empty where that was not judged.
     - `shares`: of each recording in the loss, [-]; empty of one, or of a method without.
     - `agreement`: of several recordings; None: not judged, or no two determine the same.
     """
@@ -174,20 +175,18 @@ class Estimate:
     @property
     def at_bounds(self) -> dict[str, Literal["lower", "upper"]]:
         """Which parameters ended at a bound of their range, by name: the truth may lie beyond."""
-        found: dict[str, Literal["lower", "upper"]] = {}
+        ends: dict[str, Literal["lower", "upper"]] = {}
         for bound, value in zip(self.ranges, self.values, strict=True):
             place = float(bound.to_unit(jnp.asarray(value, float)))
-            if place <= AT_BOUND:
-                found[bound.name] = "lower"
-            elif place >= 1 - AT_BOUND:
-                found[bound.name] = "upper"
-        return found
+            if not AT_BOUND < place < 1 - AT_BOUND:
+                ends[bound.name] = "lower" if place <= AT_BOUND else "upper"
+        return ends
 
     @property
     def narrowing(self) -> Float[np.ndarray, " parameter"]:
         """Standard deviation of each parameter after the recordings over that before, [-].
 
-        1: they tell nothing of it, or less than the prior. NaN without standard errors.
+        1: no information, or less than the prior's. NaN without standard errors.
         """
         prior = self.prior_errors
         if not len(prior):
@@ -198,23 +197,17 @@ class Estimate:
     def intervals(self) -> Float[np.ndarray, "parameter 2"]:
         """90 % interval of each parameter in its unit, within its range; NaN without standard
         errors."""
-        bounds, log = self.ranges, np.array([bound.log for bound in self.ranges])
-        half, values = NINETY * self.standard_errors, np.asarray(self.values, float)
-        signs = np.array([-1.0, 1.0])
-        off = np.outer(half, signs)
-        ends = np.where(log[:, None], values[:, None] * np.exp(off), values[:, None] + off)
+        bounds, values = self.ranges, np.asarray(self.values, float)[:, None]
+        off = np.outer(NINETY * self.standard_errors, [-1.0, 1.0])
+        ends = np.where([[b.log] for b in bounds], values * np.exp(off), values + off)
         return np.clip(ends, [[b.low] for b in bounds], [[b.high] for b in bounds])
 
     def correlated(self, count: int = NAMED) -> list[tuple[str, str, float]]:
-        """The pairs of parameters with the largest correlations, the largest first: what the
-        recordings cannot tell apart is near 1 or -1."""
-        names, (rows, columns) = (
-            [each.name for each in self.ranges],
-            np.triu_indices(len(self.ranges), 1),
-        )
+        """The pairs of parameters with the largest correlations, the largest first: near 1 or -1
+        the recordings cannot separate them."""
         pairs = [
-            (names[i], names[j], float(self.correlation[i, j]))
-            for i, j in zip(rows, columns, strict=True)
+            (self.ranges[i].name, self.ranges[j].name, float(self.correlation[i, j]))
+            for i, j in zip(*np.triu_indices(len(self.ranges), 1), strict=True)
             if np.isfinite(self.correlation[i, j])
         ]
         return sorted(pairs, key=lambda pair: -abs(pair[2]))[:count]
@@ -235,13 +228,12 @@ def point_estimate(
 
     The other arguments are the fields of `Estimate`.
     """
-    nothing = np.full(space.dim, np.nan)
     return Estimate(
         approach=approach,
         fabric=space(place),
         ranges=space.ranges,
         values=np.asarray(space.values(place)),
-        standard_errors=nothing,
+        standard_errors=np.full(space.dim, np.nan),
         correlation=np.full((space.dim, space.dim), np.nan),
         nuisances=(),
         loss=loss,
@@ -255,19 +247,16 @@ def point_estimate(
 
 def as_json(estimate: Estimate) -> dict[str, Any]:
     """An estimate with units, for a file; numbers that are not finite are None (null)."""
-    parameters, agreement = {}, None
-    if estimate.agreement is not None:
-        odd = estimate.agreement.contradiction
-        agreement = estimate.agreement._asdict() | {"contradiction": odd and odd._asdict()}
+    parameters = {}
     columns = estimate.values, estimate.intervals, estimate.standard_errors, estimate.narrowing
     for bound, value, interval, error, ratio in zip(estimate.ranges, *columns, strict=True):
         parameters[bound.name] = {
-            "value": _finite_or_none(value),
+            "value": _plain(value),
             "unit": bound.unit,
-            "interval_90": _nested(interval),
-            "standard_error": _finite_or_none(error),
+            "interval_90": _plain(interval),
+            "standard_error": _plain(error),
             "standard_error_is": "relative" if bound.log else "absolute",
-            "posterior_over_prior": _finite_or_none(ratio),
+            "posterior_over_prior": _plain(ratio),
             "bounds": [bound.low, bound.high],
         }
     return {
@@ -276,24 +265,30 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "converged": estimate.converged,
         "at_bounds": estimate.at_bounds,
         "parameters": parameters,
-        "correlation": _nested(estimate.correlation),
+        "correlation": _plain(estimate.correlation),
         "fabric": fabric_as_json(estimate.fabric),
-        "shape": None if estimate.shape is None else list(estimate.shape),
-        "refused": estimate.refused,
-        "reached": None if estimate.reached is None else list(estimate.reached),
-        "unsure": estimate.unsure,
-        "mesh_bias": None if estimate.mesh_bias is None else _nested(estimate.mesh_bias),
-        "agreement": agreement,
-        "shares": list(estimate.shares),
-        "misfits": [each._asdict() for each in estimate.misfits],
-        "fits": [_row(each) for each in estimate.fits],
-        "nuisances": [_row(each) for each in estimate.nuisances],
-        "loss": _finite_or_none(estimate.loss),
-        "loss_unit": estimate.loss_unit,
-        "seconds": estimate.seconds,
-        "losses": _nested(estimate.losses),
-        "history": _nested(estimate.history),
+        **{name: _plain(getattr(estimate, name)) for name in PLAIN},
     }
+
+
+PLAIN = (
+    *("shape", "refused", "reached", "unsure", "mesh_bias", "agreement", "shares", "misfits"),
+    *("fits", "nuisances", "loss", "loss_unit", "seconds", "losses", "history"),
+)
+NEEDED = ("approach", "correlation", "nuisances", "loss", "seconds", "converged", "loss_unit")
+
+
+def _plain(value: Any) -> Any:
+    """A field as JSON has it: arrays and tuples as lists, named tuples as objects."""
+    if isinstance(value, np.ndarray | np.generic):
+        plain = np.array(value, object)
+        plain[~np.isfinite(value)] = None
+        return plain.tolist()
+    if hasattr(value, "_asdict"):
+        return {name: _plain(part) for name, part in value._asdict().items()}
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def from_json(stored: dict[str, Any]) -> Estimate:
@@ -306,56 +301,37 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         stored = upgraded(stored)
     if stored.get("format") not in (FORMAT, FORMAT_0_3):
         raise ValueError(f"expected an estimate of format {FORMAT}, got {stored.get('format')}")
-
-    def optional(name: str, read: Callable[[Any], Any]) -> Any:
-        return None if stored.get(name) is None else read(stored[name])
-
     parameters = stored["parameters"]
     ranges = tuple(
         Range(name, p["unit"], *p["bounds"], log=p["standard_error_is"] == "relative")
         for name, p in parameters.items()
     )
+    fields = {"losses": np.zeros(0), "history": np.zeros(0)}
+    fields |= {name: stored[name] for name in NEEDED}
+    fields |= {name: stored[name] for name in PLAIN if stored.get(name) is not None}
     return Estimate(
-        approach=stored["approach"],
         fabric=fabric_from_json(stored["fabric"]),
         ranges=ranges,
         values=_numbers([p["value"] for p in parameters.values()]),
         standard_errors=_numbers([p["standard_error"] for p in parameters.values()]),
-        correlation=_numbers(stored["correlation"]),
-        nuisances=tuple(
-            Nuisance(n["name"], n["unit"], _number(n["value"]), _number(n["standard_error"]))
-            for n in stored["nuisances"]
-        ),
-        loss=_number(stored["loss"]),
-        losses=_numbers(stored.get("losses", [])),
-        history=_numbers(stored.get("history", [])),
-        seconds=stored["seconds"],
-        converged=stored["converged"],
-        loss_unit=stored["loss_unit"],
-        shape=optional("shape", tuple),
-        refused=stored.get("refused", ""),
-        reached=optional("reached", tuple),
-        unsure=stored.get("unsure", ""),
-        mesh_bias=optional("mesh_bias", _numbers),
-        agreement=optional("agreement", _agreement),
-        shares=tuple(stored.get("shares", ())),
-        misfits=tuple(Misfit(**each) for each in stored.get("misfits", ())),
-        fits=tuple(_fit(each) for each in stored.get("fits", ())),
         prior_errors=_prior_errors(parameters),
+        **{name: READERS.get(name, lambda value: value)(part) for name, part in fields.items()},
     )
 
 
-def _fit(stored: dict[str, Any]) -> Fit:
-    name, *numbers = (stored[key] for key in Fit._fields)
-    return Fit(name, *map(_number, numbers))
-
-
 def _prior_errors(parameters: dict[str, Any]) -> np.ndarray:
-    """Those that posterior over prior says; empty of version 0.3.0, which does not."""
+    """Standard error over posterior over prior; empty of version 0.3.0, which has no such ratio."""
     pairs = [(p["standard_error"], p.get("posterior_over_prior")) for p in parameters.values()]
     if not all(error and ratio for error, ratio in pairs):
         return np.zeros(0)
     return np.array([error / ratio for error, ratio in pairs])
+
+
+def _rows(kind: Callable[..., Any], rows: Sequence[dict[str, Any]]) -> tuple[Any, ...]:
+    """Named tuples of a kind; null is NaN."""
+    return tuple(
+        kind(*(np.nan if row[name] is None else row[name] for name in kind._fields)) for row in rows
+    )
 
 
 def _agreement(stored: dict[str, Any]) -> Agreement:
@@ -366,28 +342,41 @@ def _agreement(stored: dict[str, Any]) -> Agreement:
     return Agreement(stored["p"], tuple(stored["told"]), odd, density, stored.get("exact"))
 
 
+def _numbers(values: Any) -> np.ndarray:
+    return np.array(values, dtype=float)  # None becomes NaN
+
+
+READERS: dict[str, Callable[[Any], Any]] = {
+    **dict.fromkeys(("correlation", "mesh_bias", "losses", "history"), _numbers),
+    **dict.fromkeys(("shape", "reached", "shares"), tuple),
+    "loss": lambda value: np.nan if value is None else value,
+    "agreement": _agreement,
+    "misfits": partial(_rows, Misfit),
+    "fits": partial(_rows, Fit),
+    "nuisances": partial(_rows, Nuisance),
+}
+
+
 def upgraded(stored: dict[str, Any]) -> dict[str, Any]:
     """An estimate's JSON object of version 0.2.0 in the keys of this version.
 
-    Of convergence version 0.2.0 knew only that of the physics-informed network, in words.
+    Version 0.2.0 said only of the physics-informed network, in words, whether it had converged.
     """
     renamed = {"deviation": "standard_error", "deviation_is": "standard_error_is"}
 
     def rename(entry: dict[str, Any]) -> dict[str, Any]:
         return {renamed.get(key, key): value for key, value in entry.items()}
 
-    approach = stored["approach"]
-    known = "not converged" not in approach if approach.startswith("pinn") else None
-    fabric = stored["fabric"]
-    new = {
+    new = {key: value for key, value in stored.items() if key != "conditions"}
+    approach, fabric = stored["approach"], stored["fabric"]
+    new |= {
         "format": FORMAT,
-        "converged": known,
+        "converged": "not converged" not in approach if approach.startswith("pinn") else None,
         "parameters": {name: rename(entry) for name, entry in stored["parameters"].items()},
         "nuisances": [rename(entry) for entry in stored["conditions"]],
         "fabric": _fabric_0_2(fabric) if "C11" in fabric else fabric,
     }
-    upgraded = {key: value for key, value in stored.items() if key != "conditions"} | new
-    return upgraded | {"at_bounds": from_json({**upgraded, "at_bounds": {}}).at_bounds}
+    return new | {"at_bounds": from_json(new).at_bounds}
 
 
 def _fabric_0_2(stored: dict[str, Any]) -> dict[str, Any]:
@@ -400,30 +389,3 @@ def _fabric_0_2(stored: dict[str, Any]) -> dict[str, Any]:
         "membrane": {"law": "OrthotropicMembrane", **membrane},
         "bending": {"law": "PlateBending", **bending},
     }
-
-
-def _finite_or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _row(values: Any) -> dict[str, Any]:
-    """A named tuple's fields, with None for numbers that are not finite."""
-    return {
-        name: _finite_or_none(each) if isinstance(each, float) else each
-        for name, each in values._asdict().items()
-    }
-
-
-def _nested(values: np.ndarray) -> Any:
-    """Nested lists, with None for numbers that are not finite: JSON has no word for them."""
-    plain = values.astype(object)
-    plain[~np.isfinite(values)] = None
-    return plain.tolist()
-
-
-def _number(value: float | None) -> float:
-    return np.nan if value is None else value
-
-
-def _numbers(values: Any) -> np.ndarray:
-    return np.array(values, dtype=float)  # None becomes NaN

@@ -1,11 +1,11 @@
 """Gauss-Newton on nearest-point distances, with forward sensitivities: the default of r2s.
 
-The loss is that of DIFFCLOUD turned round (recording to simulated surface, so that a partial view
-does not attract hidden parts), robust against outliers. The parameters are few, so forward mode
-gives the normal equations, and with them step and covariance, for about the cost of one gradient.
+The loss is the reverse of DIFFCLOUD's (from recording to simulated surface, so that a partial view
+does not attract hidden parts), robust against outliers. With few parameters forward mode gives the
+normal equations, and with them step and covariance, for about the cost of one gradient.
 
-Recordings of one fabric are weighted by their frames and by how well each can be followed
-(`Problem.weight`). For `theta` see `r2s.estimation.prediction`.
+Recordings of one fabric are weighted by their frames and `Problem.weight`. For `theta` see
+`r2s.estimation.prediction`.
 """
 
 import math
@@ -39,8 +39,8 @@ from r2s.estimation.normal_equations import (
 )
 from r2s.estimation.prediction import (
     Derive,
+    Predicted,
     Prediction,
-    Sensitivity,
     Theta,
     derivatives_at,
     predict,
@@ -53,8 +53,8 @@ from r2s.estimation.problem import Problems
 
 MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
 LONGEST_STEP = 0.2  # of a parameter's range
-FINEST = 1e-5  # [m]: no recording is better
-AT_BOUND = 1e-6  # of a range: nearer than that, in single precision, is at the bound
+FINEST = 1e-5  # [m]: the least error of a recording
+AT_BOUND = 1e-6  # of a range, within which a parameter in single precision is at a bound
 
 
 class Normal(eqx.Module):
@@ -76,12 +76,11 @@ class Normal(eqx.Module):
 
 
 class Descent(eqx.Module):
-    """The state of a Levenberg-Marquardt descent.
+    """The state of a Levenberg-Marquardt descent, with the normal equations at its theta.
 
-    - `theta`, and the normal equations there, `normal`.
     - `damping`, `growth`: see `r2s.estimation.least_squares.Damping`.
     - `scale`: of the robust loss, [m], see `r2s.metrics.losses.robust`; 0: no outliers.
-    - `stage`: its stage in an estimate, see `iterations` of `r2s.estimation.method.Budget`.
+    - `stage`: see `max_iterations` of `r2s.estimation.method.Budget`.
     """
 
     theta: Float[Array, "*start theta"]
@@ -94,10 +93,8 @@ class Descent(eqx.Module):
 
 def recording_weights(problems: Problems) -> list[Float[Array, ""]]:
     """Weight of each recording in the loss: its share of all frames, times its `weight`."""
-    frames = [
-        len(problem.frames) * (jnp.ones((), float) if problem.weight is None else problem.weight)
-        for problem in problems
-    ]
+    weights = (jnp.ones((), float) if p.weight is None else p.weight for p in problems)
+    frames = [len(p.frames) * weight for p, weight in zip(problems, weights, strict=True)]
     return [count / sum(frames) for count in frames]
 
 
@@ -108,17 +105,17 @@ def loss_at(
 
     - `loss`: of one recording; None: the robust one, of a `scale` [m].
     """
-    seen = [predict(each, theta[theta_indices(problems, i)]) for i, each in enumerate(problems)]
-    return _loss_from(problems, seen, loss, scale)
+    predictions = [predict(p, theta[theta_indices(problems, i)]) for i, p in enumerate(problems)]
+    return _loss_from(problems, predictions, loss, scale)
 
 
 def _loss_from(
-    problems: Problems, seen: Sequence[Prediction], loss: Loss | None, scale: Scale
+    problems: Problems, predictions: Sequence[Prediction], loss: Loss | None, scale: Scale
 ) -> Float[Array, ""]:
-    total = jnp.zeros((), float)
-    for problem, share, found in zip(problems, recording_weights(problems), seen, strict=True):
-        value = loss_of(problem, found, scale) if loss is None else loss(problem, found)
-        total += share * jnp.where(found.ok, value, jnp.inf)
+    total, weights = jnp.zeros((), float), recording_weights(problems)
+    for problem, share, prediction in zip(problems, weights, predictions, strict=True):
+        value = loss_of(problem, prediction, scale) if loss is None else loss(problem, prediction)
+        total += share * jnp.where(prediction.ok, value, jnp.inf)
     return total
 
 
@@ -129,32 +126,23 @@ def normal_at(
 
     - `scale`: of the robust loss [m]. `width`: see `r2s.estimation.prediction.sensitivities`.
     """
-    predicted = [
-        sensitivities(each, theta[theta_indices(problems, i)], width)
-        for i, each in enumerate(problems)
-    ]
+    parts = (theta[theta_indices(problems, i)] for i in range(len(problems)))
+    predicted = [sensitivities(p, own, width) for p, own in zip(problems, parts, strict=True)]
     return _normal_from(problems, theta, predicted, scale)
 
 
-def _normal_from(
-    problems: Problems,
-    theta: Theta,
-    predicted: Sequence[tuple[Prediction, Sensitivity]],
-    scale: Scale,
-) -> Normal:
+def _normal_from(problems: Problems, theta: Theta, predicted: Predicted, scale: Scale) -> Normal:
     losses, spreads, scores, matrices, noise = [], [], [], [], []
     weights, size = recording_weights(problems), theta_length(problems)
-    for which, (problem, share, (seen, slope)) in enumerate(
-        zip(problems, weights, predicted, strict=True)
-    ):
+    for which, (share, (prediction, slope)) in enumerate(zip(weights, predicted, strict=True)):
         index = theta_indices(problems, which)
-        found = normal_equations_of(problem, seen, slope, scale)
-        losses.append(share * jnp.where(seen.ok, found.loss, jnp.inf))
-        spreads.append(found.spread)
-        zeros = jnp.zeros((len(found.scores), size, size), theta.dtype)
-        scores.append(zeros[:, 0].at[:, index].set(share * found.scores))
-        matrices.append(zeros.at[:, index[:, None], index].set(share * found.matrices))
-        noise.append(share * found.noise)
+        own = normal_equations_of(problems[which], prediction, slope, scale)
+        losses.append(share * jnp.where(prediction.ok, own.loss, jnp.inf))
+        spreads.append(own.spread)
+        zeros = jnp.zeros((len(own.scores), size, size), theta.dtype)
+        scores.append(zeros[:, 0].at[:, index].set(share * own.scores))
+        matrices.append(zeros.at[:, index[:, None], index].set(share * own.matrices))
+        noise.append(share * own.noise)
     spread = jnp.sqrt(jnp.stack(weights) @ jnp.stack(spreads) ** 2)
     score, matrix = jnp.concatenate(scores), jnp.concatenate(matrices)
     least = least_weight(problems, spread)
@@ -178,12 +166,11 @@ def scatter(
 ) -> Float[Array, "theta theta"]:
     """Covariance of a gradient that is a sum over clusters with independent errors.
 
-    Each score is corrected to what it would be had its cluster not been fitted: the sandwich
-    estimator is the jackknife then (CR3 of Bell and McCaffrey 2002). Without a cluster the fit is
-    one standard deviation of the prior away at most: where one cluster alone determines a
-    direction, rounding would decide. In no direction is the covariance less than for residuals with
-    independent errors, of a variance of `noise` times the cluster's matrix: less would be the
-    chance of few clusters.
+    Each score is that of a fit without its cluster: the sandwich estimator is the jackknife then
+    (CR3 of Bell and McCaffrey 2002). Without a cluster the fit is one standard deviation of the
+    prior away at most: where one cluster alone determines a direction, rounding would decide. In no
+    direction is the covariance less than for residuals with independent errors, of a variance of
+    `noise` times the cluster's matrix: less would be the chance of few clusters.
 
     - `precision`, `weight` [m^2]: of the prior.
     """
@@ -233,12 +220,11 @@ def prior_terms(problems: Problems, theta: Theta) -> tuple[Theta, Float[Array, "
 
 @eqx.filter_jit
 def prior_weight(problems: Problems, normal: Normal) -> Float[Array, ""]:
-    """Weight [m^2] of the prior beside the loss: how much the loss scatters by chance.
+    """Weight [m^2] of the prior beside the loss: the likelihood is exp(-loss / weight).
 
-    The likelihood is exp(-loss / weight) when the gradient scatters like weight times the matrix
-    (magnitude adjustment of a composite likelihood, Pauli, Racugno and Ventura 2011). At most, as
-    if all points of a cluster were one: few clusters of a rough loss may scatter by far more, and
-    the prior would draw a fit to where its loss is several times as large.
+    The gradient scatters like weight times the matrix then (magnitude adjustment of a composite
+    likelihood, Pauli, Racugno and Ventura 2011). At most, as if all points of a cluster were one:
+    few clusters of a rough loss may scatter by far more, and the prior would dominate.
     """
     _, precision = prior_terms(problems, jnp.zeros(theta_length(problems), float))
     least = least_weight(problems, normal.spread)
@@ -295,11 +281,8 @@ def is_finite(normal: Normal) -> Bool[Array, ""]:
 
 @eqx.filter_jit
 def accept(problems: Problems, descent: Descent, trial: Theta, tried: Normal, prior) -> Descent:
-    """The descent after a trial: moved if that lowers the objective, else damped more.
-
-    It does not move to where a derivative is not finite: from there it could neither go on nor give
-    standard errors.
-    """
+    """The descent after a trial: moved if that lowers the objective and all derivatives are finite,
+    else damped more."""
     new = objective(problems, trial, tried.loss, prior)
     old = objective(problems, descent.theta, descent.normal.loss, prior)
     better = (new < old) & is_finite(tried)
@@ -318,8 +301,8 @@ Limits = tuple[Float[np.ndarray, " theta"], Float[np.ndarray, " theta"]]
 
 
 def room(problems: Problems, theta: Theta) -> Limits:
-    """How far each parameter may go down, at most 0, and up: a fabric's to its bounds, nuisance
-    parameters without limit."""
+    """The largest steps of each parameter down, at most 0, and up: a fabric's to its bounds,
+    nuisance parameters without limit."""
     is_fabric = np.arange(theta_length(problems)) < problems[0].space.dim
     at = np.asarray(theta, np.float64)
     down, up = MARGIN - at, 1 - MARGIN - at
@@ -335,7 +318,7 @@ def only_held(limits: Limits) -> Limits:
 
 
 def held_back(problems: Problems, end: Descent, prior: float) -> Float[np.ndarray, " theta"]:
-    """How much farther the end of a descent would go without bounds; zero if it is at none.
+    """How much farther the end of a descent would be without bounds; zero if it is at none.
 
     - `prior`: its weight, see `prior_weight`.
     """
@@ -348,24 +331,16 @@ def held_back(problems: Problems, end: Descent, prior: float) -> Float[np.ndarra
 
 
 _compiled_loss = compile_once(_loss_from)
-_compiled_normal = compile_once(_normal_from)
+normal_from = compile_once(_normal_from)  # of predictions at a theta
 _losses = eqx.filter_jit(eqx.filter_vmap(loss_at, in_axes=(None, 0)))
 _normals = eqx.filter_jit(eqx.filter_vmap(normal_at, in_axes=(None, 0, 0, None)))
 
 
-def loss_from(problems: Problems, seen: Sequence[Prediction], scale: Array | float = 0.0) -> float:
+def loss_from(
+    problems: Problems, predictions: Sequence[Prediction], scale: Array | float = 0.0
+) -> float:
     """The robust loss [m^2] of a prediction of each recording, see `loss_at`."""
-    return float(_compiled_loss(problems, list(seen), None, jnp.asarray(scale, float)))
-
-
-def normal_from(
-    problems: Problems,
-    theta: Theta,
-    predicted: Sequence[tuple[Prediction, Sensitivity]],
-    scale: Array,
-) -> Normal:
-    """`normal_at` a theta from the prediction of each recording and its derivative."""
-    return _compiled_normal(problems, theta, list(predicted), scale)
+    return float(_compiled_loss(problems, list(predictions), None, jnp.asarray(scale, float)))
 
 
 def losses_at(
@@ -396,13 +371,12 @@ def normals_at(
     The sizes of batches are powers of two, so that few are compiled.
     """
 
-    def one(pair) -> Normal:
-        theta, scale = pair
-        return normal_from(problems, theta, derive(problems, theta, width), scale)
-
     if jax.default_backend() == "cpu" or len(thetas) == 1:
-        return thread_map(one, zip(thetas, scales, strict=True))
+        return thread_map(
+            lambda pair: normal_from(problems, pair[0], derive(problems, pair[0], width), pair[1]),
+            zip(thetas, scales, strict=True),
+        )
     more = 2 ** math.ceil(math.log2(len(thetas))) - len(thetas)
     filled = (jnp.stack([*parts, *[parts[-1]] * more]) for parts in (thetas, scales))
-    found = _normals(problems, *filled, width)
-    return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(thetas))]
+    normals = _normals(problems, *filled, width)
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], normals) for i in range(len(thetas))]

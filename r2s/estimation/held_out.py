@@ -1,4 +1,4 @@
-"""Cross-validation: is an estimate better than the prior on a recording that it was not made from?
+"""Cross-validation: is an estimate better than the prior on a recording that was held out?
 
 Of three recordings or more one is held out; the prior is that of fabrics of which only the weight
 is known (`r2s.materials.prior`).
@@ -22,7 +22,7 @@ from r2s.scenarios.scenario import from_recording, in_denser_air
 FEWEST = 3  # recordings, of which one is held out without being asked for
 NONE = "none"  # the name by which no recording is held out
 DRAWS = 8
-ALIKE = 1.25  # of the largest error over the least: less, and all fabrics look alike
+ALIKE = 1.25  # of the largest error over the least: below, fabrics hardly differ
 AIR = "air ratio"  # the nuisance, of `r2s.estimation.prediction`
 
 
@@ -33,7 +33,7 @@ class HeldOut(NamedTuple):
       over the frames that count, [m]; infinite where the simulation diverged.
     - `defaults`: the same of samples of the prior, without the `diverged` ones, [m]. `middle`: of
       the prior mean, the best guess by the weight.
-    - `air`: density of the air that all of them moved in, relative to that written down.
+    - `air`: density of the air in all simulations, relative to the recorded one.
     """
 
     recording: str
@@ -44,47 +44,47 @@ class HeldOut(NamedTuple):
     air: float = 1.0
 
     @property
+    def average(self) -> float:
+        """The mean error of the samples; NaN without any."""
+        return float(np.mean(self.defaults)) if self.defaults else np.nan
+
+    @property
     def is_better(self) -> bool:
         """Whether the error is less than that of the prior mean, and than the mean of the
         samples; False where none of these ran."""
-        return bool(self.defaults) and self.error < min(float(np.mean(self.defaults)), self.middle)
+        return self.error < self.middle and self.error < self.average
 
     @property
     def is_discriminating(self) -> bool:
-        """Whether the motion discriminates: not where samples, prior mean and estimate are alike
-        in it (`ALIKE`), as in a fold that lies on the table."""
-        others = [each for each in (*self.defaults, self.middle) if np.isfinite(each)]
+        """Whether the motion discriminates: not where samples, prior mean and estimate have about
+        the same error (`ALIKE`), as in a fold that lies on the table."""
+        others = [error for error in (*self.defaults, self.middle) if np.isfinite(error)]
         least, most = min(others, default=0.0), max(others, default=0.0)
         return most > ALIKE * least or not least / ALIKE <= self.error < ALIKE * most
 
     def describe(self) -> str:
         """One line: the errors, and what they say; a warning where the prior is as good."""
-        lost = f", {self.diverged} more diverged" if self.diverged else ""
-        errors = np.array(self.defaults or (np.nan,))
-        least, most, mean = (_mm(each) for each in (errors.min(), errors.max(), errors.mean()))
+        diverged = f", {self.diverged} more diverged" if self.diverged else ""
+        errors = self.defaults or (np.nan,)
         error = f"{_mm(self.error)} mm" if np.isfinite(self.error) else "the simulation diverged"
         air = "" if self.air == 1 else f" (all in air {self.air:.2f} times as dense, as found)"
         words = (
             f"held-out motion {self.recording}: mean distance {error}; prior mean "
-            f"{_mm(self.middle)} mm; prior samples {mean} mm on average ({least} to {most}, "
-            f"{len(self.defaults)} samples{lost}){air}"
+            f"{_mm(self.middle)} mm; prior samples {_mm(self.average)} mm on average "
+            f"({_mm(min(errors))} to {_mm(max(errors))}, {len(self.defaults)} samples{diverged})"
+            f"{air}"
         )
         if not self.is_discriminating:
             return f"{words}: fabrics hardly differ in this motion, no verdict"
         if self.is_better:
             others = "every" if self.error < min(self.defaults) else "the average"
             return f"{words}: better than the prior mean and {others} sample"
+        rivals = {"the prior mean": self.middle, "the average sample of the prior": self.average}
+        better = [name for name, error in rivals.items() if not self.error < error]
         return (
-            f"warning: {words}: not better than {' and '.join(self._not_beaten)}, so do not rely "
-            "on this estimate in such motions; or the recording is of another fabric"
+            f"warning: {words}: not better than {' and '.join(better)}, so do not rely on this "
+            "estimate in such motions; or the recording is of another fabric"
         )
-
-    @property
-    def _not_beaten(self) -> list[str]:
-        """Which of the prior's two errors this one is not below."""
-        average = float(np.mean(self.defaults)) if self.defaults else -np.inf
-        pairs = (self.middle, "the prior mean"), (average, "the average sample of the prior")
-        return [name for other, name in pairs if not self.error < other]
 
 
 def choose(recordings: Sequence[Recording], name: str | None = None) -> int | None:
@@ -97,20 +97,21 @@ def choose(recordings: Sequence[Recording], name: str | None = None) -> int | No
     """
     if name == NONE:
         return None
-    with_clouds = [i for i, each in enumerate(recordings) if has_clouds(each)]
+    with_clouds = [i for i, recording in enumerate(recordings) if has_clouds(recording)]
     if name is None:
         moving = [i for i in with_clouds if recordings[i].info.scenario != "stretching"]
-        telling = [i for i in moving if recordings[i].info.scenario != "folding"] or moving
-        return telling[-1] if len(recordings) >= FEWEST and len(moving) > 1 else None
-    found = [i for i, each in enumerate(recordings) if each.info.name == name]
-    if len(found) != 1:
-        known = ", ".join(each.info.name for each in recordings)
-        raise ValueError(f"{len(found) or 'no'} recordings are called {name!r}; there are {known}")
+        best = [i for i in moving if recordings[i].info.scenario != "folding"] or moving
+        return best[-1] if len(recordings) >= FEWEST and len(moving) > 1 else None
+    names = [recording.info.name for recording in recordings]
+    count = names.count(name)
+    if count != 1:
+        known = ", ".join(names)
+        raise ValueError(f"{count or 'no'} recordings are called {name!r}; there are {known}")
     if len(recordings) < 2:
         raise ValueError(f"{name!r} is the only recording: nothing is left to estimate from")
-    if found[0] not in with_clouds:
+    if names.index(name) not in with_clouds:
         raise ValueError(f"{name!r} has no clouds to be judged by")
-    return found[0]
+    return names.index(name)
 
 
 def why_none(recordings: Sequence[Recording], name: str | None = None) -> str:
@@ -148,19 +149,20 @@ def judge(
     """
     clear_in_time()
     density = float(fabric.density)
-    each = (fabric, prior.middle(density), *prior.fabrics(density, count, jr.key(0)))
-    error, middle, *others = (_error(recording, one, shape, air) for one in each)
+    fabrics = (fabric, prior.middle(density), *prior.fabrics(density, count, jr.key(0)))
+    error, middle, *others = (_error(recording, one, shape, air) for one in fabrics)
     finite = tuple(other for other in others if np.isfinite(other))
     return HeldOut(recording.info.name, error, finite, count - len(finite), middle, air)
 
 
 def air_found(estimate: Estimate, recordings: Sequence[Recording]) -> float:
-    """The estimated density of the air, relative to that written down, where one of the estimate's
-    recordings doubts it; else 1: a wind alone determines only its own speed."""
-    if not any(each.info.doubt is not None and each.info.doubt.air for each in recordings):
+    """The estimated density of the air, relative to the recorded one, where one of the estimate's
+    recordings says that it is uncertain; else 1: a wind alone determines only its own speed."""
+    doubts = [recording.info.doubt for recording in recordings]
+    if not any(doubt is not None and doubt.air for doubt in doubts):
         return 1.0
-    # a method that reports no nuisances has left the air as it was written down
-    return next((each.value for each in estimate.nuisances if each.name == AIR), 1.0)
+    # a method that reports no nuisances has not changed the air
+    return next((n.value for n in estimate.nuisances if n.name == AIR), 1.0)
 
 
 def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int], air: float) -> float:

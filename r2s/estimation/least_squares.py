@@ -3,9 +3,9 @@
     solver = BoundedGaussNewton(rtol=1e-5, atol=1e-5, low=0.0, high=1.0)
     optimistix.least_squares(residual, solver, y0).value
 
-Optimistix's own solvers have neither bounds nor a prior. `proposed` and `damped` are one step of
-its Levenberg-Marquardt iteration, for callers that have normal equations instead of residuals;
-`bounded_step` is the exact minimum of a quadratic within bounds.
+The solvers of optimistix have neither bounds nor a prior. `proposed` and `damped` are one step of
+this one, for callers that have normal equations instead of residuals; `bounded_step` is the exact
+minimum of a quadratic within bounds.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jax.flatten_util import ravel_pytree
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 from scipy import optimize
 
@@ -93,10 +93,7 @@ def bounded_step(
     limits: tuple[Float[np.ndarray, " y"], Float[np.ndarray, " y"]],
 ) -> Float[np.ndarray, " y"]:
     """The step x within limits that minimises gradient x + x matrix x / 2; NaN if these are not
-    finite. The matrix is positive up to rounding.
-
-    Clipping an unbounded step instead would leave the other entries beside an unreachable value.
-    """
+    finite. The matrix is positive up to rounding."""
     if not (np.isfinite(gradient).all() and np.isfinite(matrix).all()):
         return np.full(len(gradient), np.nan)
     sizes, axes = np.linalg.eigh(np.asarray(matrix, np.float64))
@@ -131,46 +128,42 @@ class BoundedGaussNewton(optimistix.AbstractLeastSquaresSolver):
     within bounds.
 
     - `rtol`, `atol`: it ends when a step changes y and the objective by no more than these.
-    - `low`, `high`: bounds of y, numbers or as y is.
-    - `mean`, `precision`: prior of y as one vector (`jax.flatten_util.ravel_pytree`), or None.
+    - `low`, `high`: bounds of y. `mean`, `precision`: its prior, or None.
 
-    A trial whose residual is not finite is rejected. If that of the start is not, or no step is
-    short enough, the result is not successful. The derivative is forward (`jax.linearize`).
+    y is a vector. A trial whose residual is not finite is rejected. If that of the start is not, or
+    no step is short enough, the result is not successful. The derivative is forward
+    (`jax.linearize`).
     """
 
     rtol: float
     atol: float
-    low: PyTree = -jnp.inf
-    high: PyTree = jnp.inf
+    low: Float[ArrayLike, "#y"] | float = -jnp.inf
+    high: Float[ArrayLike, "#y"] | float = jnp.inf
     mean: Float[Array, " y"] | None = None
     precision: Float[Array, "y y"] | None = None
     norm: Callable[[PyTree], Array] = optimistix.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        flat, _ = ravel_pytree(y)
-        zero = jnp.zeros_like(flat)
+        zero = jnp.zeros_like(y)
         return _State(
-            loss=jnp.asarray(jnp.inf, flat.dtype),
+            loss=jnp.asarray(jnp.inf, y.dtype),
             gradient=zero,
-            matrix=jnp.eye(len(flat), dtype=flat.dtype),
-            damping=Damping.initial(flat.dtype),
+            matrix=jnp.eye(len(y), dtype=y.dtype),
+            damping=Damping.initial(y.dtype),
             change=zero,
-            gain=jnp.asarray(jnp.inf, flat.dtype),
+            gain=jnp.asarray(jnp.inf, y.dtype),
             is_better=jnp.asarray(False),
             aux=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux_struct),
         )
 
     def step(self, fn, y, args, options, state: _State, tags):
-        flat, unravel = ravel_pytree(y)
-        low, high = (_like(bound, y, flat) for bound in (self.low, self.high))
+        low, high = (
+            jnp.broadcast_to(jnp.asarray(bound), y.shape).astype(y.dtype)
+            for bound in (self.low, self.high)
+        )
         # the gradient of `init` is zero: the first trial is the start
-        trial = proposed(flat, state.gradient, state.matrix, state.damping, low, high)
-
-        def residual(at):
-            value, aux = fn(unravel(at), args)
-            return ravel_pytree(value)[0], aux
-
-        value, slope, aux = jax.linearize(residual, trial, has_aux=True)
+        trial = proposed(y, state.gradient, state.matrix, state.damping, low, high)
+        value, slope, aux = jax.linearize(lambda at: fn(at, args), trial, has_aux=True)
         slope = jax.vmap(slope, out_axes=1)(jnp.eye(len(trial), dtype=trial.dtype))
         loss, gradient, matrix = value @ value / 2, slope.T @ value, slope.T @ slope
         if self.precision is not None:
@@ -189,16 +182,15 @@ class BoundedGaussNewton(optimistix.AbstractLeastSquaresSolver):
             gradient=choose(gradient, state.gradient),
             matrix=choose(matrix, state.matrix),
             damping=damped(state.damping, is_better),
-            change=trial - flat,
+            change=trial - y,
             gain=state.loss - loss,
             is_better=is_better,
             aux=choose(aux, state.aux),
         )
-        return unravel(choose(trial, flat)), after, after.aux
+        return choose(trial, y), after, after.aux
 
     def terminate(self, fn, y, args, options, state: _State, tags):
-        flat, _ = ravel_pytree(y)
-        small = jnp.all(jnp.abs(state.change) <= self.atol + self.rtol * jnp.abs(flat))
+        small = jnp.all(jnp.abs(state.change) <= self.atol + self.rtol * jnp.abs(y))
         little = jnp.abs(state.gain) <= self.atol + self.rtol * jnp.abs(state.loss)
         has_begun = jnp.isfinite(state.loss)
         # a rejected step so short that rounding decides is an end, too
@@ -213,11 +205,3 @@ class BoundedGaussNewton(optimistix.AbstractLeastSquaresSolver):
 
     def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
         return y, aux, {"loss": state.loss, "matrix": state.matrix}
-
-
-def _like(bound: PyTree, y: PyTree, flat: Float[Array, " y"]) -> Float[Array, " y"]:
-    """Bounds of each entry of y, from numbers or a tree like y."""
-    whole = jax.tree.structure(bound) == jax.tree.structure(y)
-    tree = bound if whole else jax.tree.map(lambda _: bound, y)
-    full = jax.tree.map(lambda b, part: jnp.broadcast_to(jnp.asarray(b), part.shape), tree, y)
-    return ravel_pytree(full)[0].astype(flat.dtype)

@@ -1,6 +1,6 @@
 """One contract for all estimators: recordings of a fabric in, an `Estimate` out.
 
-    found = METHODS["diffcloud"]().estimate(recordings, space, key=jax.random.key(0))
+    estimate = METHODS["diffcloud"]().estimate(recordings, space, key=jax.random.key(0))
 
 A method is a frozen dataclass, whose fields are what it needs beyond recordings, space, budget and
 key. `r2s.estimation.methods.METHODS` has all methods.
@@ -33,7 +33,7 @@ Progress = Callable[[int, float], None]  # called with the iteration and the bes
 
 
 def tell(progress: Progress | None, words: str) -> None:
-    """Report what is being done to a progress that has a method `say`."""
+    """Report the current step to a progress that has a method `say`."""
     say = getattr(progress, "say", None)
     if say is not None:
         say(words)
@@ -42,9 +42,9 @@ def tell(progress: Progress | None, words: str) -> None:
 class Budget(NamedTuple):
     """How much an estimate may cost. Each method uses some of these, see `Method.budget_fields`.
 
-    - `num_samples`: of the parameter range that are tried first; 0: descend from the start alone.
-    - `num_starts`: how many of the best samples are descended from. Of more than three descents the
-      better half go on every three iterations, until three are left.
+    - `num_samples`: of the parameter range that are tried first; 0: only the start.
+    - `num_starts`: descents, from the best samples. Of more than three, the better half continue
+      after every three iterations, until three are left.
     - `max_iterations`: of each stage of a descent. First all starts descend; then the best one
       descends with outliers left out, until its next step would change no parameter by more than
       about a tenth of its standard error. Of a method that trains: its epochs.
@@ -52,13 +52,13 @@ class Budget(NamedTuple):
       None: exact derivatives.
     - `frame_fractions`: of the frames, from the first, that count in earlier stages. The end of a
       long motion can depend so steeply on the fabric that a loss over all of it is low only near
-      the truth; the loss of its beginning leads there.
+      the truth; that of its beginning is smoother.
     - `num_probes`: an even number of places around the end, from which Gauss-Newton steps are
-      taken; the standard errors grow by how far apart these steps end.
+      taken; the standard errors grow with the scatter of the ends of these steps.
     - `max_evaluations`: simulations of a search without derivatives.
-    - `is_intermediate`: whether a descent on a finer mesh goes on from the end, which may be less
+    - `is_intermediate`: whether a descent on a finer mesh starts at the end, which may be less
       exact.
-    - `warm_start`: whether the start is near the end: outliers are left out from there on.
+    - `warm_start`: whether the start is near the end: outliers are left out from the first step.
     """
 
     num_samples: int = 24
@@ -73,12 +73,8 @@ class Budget(NamedTuple):
 
 
 class DataRequirements(NamedTuple):
-    """What a method reads of a recording, beside its sheet, table, wind and the grippers' path.
-
-    - `frames`: of which it reads clouds, markers or force.
-    - `points`: at most, of each cloud; 0: no clouds; None: all points.
-    - `markers`: whether it reads them. `force`: of the pulled clamp, on them.
-    """
+    """The data of a recording that a method reads, beside its sheet, table, wind and the grippers'
+    path: clouds (`points` of each at most; None: all), markers and force in some `frames`."""
 
     frames: tuple[int, ...]
     points: int | None = 0
@@ -87,7 +83,7 @@ class DataRequirements(NamedTuple):
 
 
 def frames_that_count(recording: Recording) -> tuple[int, ...]:
-    """All of them, from the first to the last."""
+    """All used frames of a recording."""
     first, last = recording.info.frames_used
     return tuple(range(first, last + 1))
 
@@ -146,13 +142,14 @@ class Method(abc.ABC):
         if isinstance(space, InformedSpace):
             self.check_prior()
         began = time.perf_counter()
-        found = self._estimate(list(recordings), space, budget or self.budget, key)
-        seconds = max(found.seconds, time.perf_counter() - began)  # of a resumed run the former
-        compared = [allowance(*pair, found) for pair in zip(found.fits, recordings, strict=False)]
+        estimate = self._estimate(list(recordings), space, budget or self.budget, key)
+        pairs = zip(estimate.fits, recordings, strict=False)
         errors = np.sqrt(np.diag(np.linalg.inv(np.asarray(space.prior()[1], float))))
-        errors *= [bound.width for bound in space.ranges]
         return dataclasses.replace(
-            found, fits=tuple(compared), prior_errors=errors, seconds=seconds
+            estimate,
+            fits=tuple(allowance(fit, recording, estimate) for fit, recording in pairs),
+            prior_errors=errors * [bound.width for bound in space.ranges],
+            seconds=max(estimate.seconds, time.perf_counter() - began),  # of a resumed run
         )
 
     def check(self, recordings: Sequence[Recording]) -> None:
@@ -161,8 +158,8 @@ class Method(abc.ABC):
             raise ValueError(f"{self.name} needs a recording")
         if len(recordings) > 1 and not self.several:
             raise ValueError(f"{self.name} takes one recording, got {len(recordings)}")
-        for each in recordings:
-            if reason := self.refusal(self.chosen_solver, each.info.scenario):
+        for recording in recordings:
+            if reason := self.refusal(self.chosen_solver, recording.info.scenario):
                 raise ValueError(f"{self.name}: {reason}")
 
     def check_prior(self) -> None:
@@ -182,13 +179,13 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def reads(self, recording: Recording) -> DataRequirements:
-        """What an estimate from a recording depends on."""
+        """The data of a recording on which an estimate depends."""
 
     @classmethod
     def options(cls) -> frozenset[str]:
         """Names of the fields that this method has beside those of all methods."""
-        own = {field.name for field in dataclasses.fields(cls)}
-        return frozenset(own - {field.name for field in dataclasses.fields(Method)})
+        own, shared = ({field.name for field in dataclasses.fields(c)} for c in (cls, Method))
+        return frozenset(own - shared)
 
     @classmethod
     def refusal(cls, solver: str, scenario: str) -> str:
@@ -215,7 +212,7 @@ class Method(abc.ABC):
 
 
 def allowance(fit: Fit, recording: Recording, estimate: Estimate) -> Fit:
-    """A fit to a recording with its name, and what its noise and the estimate's mesh allow."""
+    """A fit with the name and the noise of its recording, and the error of the estimate's mesh."""
     info, noise, mesh = recording.info, math.nan, math.nan
     if not clouds_are_markers(recording):
         noise = mean_distance(point_noise(recording))

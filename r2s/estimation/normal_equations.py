@@ -1,4 +1,4 @@
-"""What a prediction says against what was seen: clouds, markers and forces, each a robust mean."""
+"""Distances of a prediction from clouds, markers and forces: robust loss, and normal equations."""
 
 from collections.abc import Callable
 
@@ -24,14 +24,14 @@ from r2s.recordings.views import in_view
 Scale = Float[Array, ""] | float
 Loss = Callable[[Problem, Prediction], Float[Array, ""]]  # [m^2]
 
-PATCHES = 3  # along a side of the sheet: what lies in one patch errs alike
-MEMORY = 8  # frames, in which it does so
-SLACK = 3e-3  # [m], which noise seldom throws a point of a depth camera beyond a border
+PATCHES = 3  # along a side of the sheet: residuals in one patch have correlated errors
+MEMORY = 8  # frames in which they do
+SLACK = 3e-3  # [m]: noise seldom moves a point of a depth camera farther beyond a border
 FLATTEST = 0.3  # curvature of a robust loss over the mean weight, at least
 
 
 class NormalEquations(eqx.Module):
-    """A loss with its normal equations in theta, by clusters of residuals that err alike.
+    """A loss with its normal equations in theta, by clusters of residuals with correlated errors.
 
     A cluster is a patch of the sheet over some frames, a marker, or a force over some frames.
 
@@ -40,7 +40,7 @@ class NormalEquations(eqx.Module):
     - `scores`, `matrices`: share of each cluster in the loss's gradient and Gauss-Newton matrix,
       [m^2].
     - `noise`: variance [m^2] of each cluster's residuals; times its matrix it is the covariance
-      [m^4] of its score if all residuals err independently.
+      [m^4] of its score if all residuals are independent.
     """
 
     loss: Float[Array, ""]
@@ -50,43 +50,42 @@ class NormalEquations(eqx.Module):
     noise: Float[Array, " cluster"]
 
 
-def loss_of(problem: Problem, seen: Prediction, scale: Scale = 0.0) -> Float[Array, ""]:
-    """The robust mean [m^2] of all that was seen.
+def loss_of(problem: Problem, prediction: Prediction, scale: Scale = 0.0) -> Float[Array, ""]:
+    """The robust mean [m^2] of all distances to the observations.
 
     For `scale` [m] see `r2s.metrics.losses.robust`.
     """
-    mesh, total = problem.scenario.scene.mesh, jnp.zeros((), seen.x.dtype)
+    total = jnp.zeros((), prediction.x.dtype)
     if problem.clouds is not None:
-        total += masked_mean(
-            robust(_residuals(problem.clouds, mesh, seen, scale)[0], scale), problem.clouds.mask
-        )
+        distance, mask = point_distances(problem, prediction, scale)
+        total += masked_mean(robust(distance, scale), mask)
     if problem.markers is not None:
-        gap = _gaps(problem.markers, seen.x)
+        gap = _gaps(problem.markers, prediction.x)
         total += masked_mean(robust(length(gap), scale), problem.markers.seen)
     if problem.expected is not None:
-        gap, counts = _to_clouds(problem.expected, seen.x)
+        gap, counts = _to_clouds(problem.expected, prediction.x)
         total += masked_mean(robust(length(gap), scale), counts)
-    if problem.force is not None and seen.force is not None:
-        total += _force_loss(problem.force, _force_gaps(problem.force, seen.force))
+    if problem.force is not None and prediction.force is not None:
+        total += _force_loss(problem.force, _force_gaps(problem.force, prediction.force))
     return total
 
 
 def normal_equations_of(
-    problem: Problem, seen: Prediction, slope: Sensitivity, scale: Scale = 0.0
+    problem: Problem, prediction: Prediction, slope: Sensitivity, scale: Scale = 0.0
 ) -> NormalEquations:
-    """Loss and normal equations of all that was seen, from a prediction and its derivative."""
-    mesh = problem.scenario.scene.mesh
-    parts = []
-    if problem.clouds is not None:
-        parts.append(_of_clouds(problem.clouds, mesh, seen, slope, scale))
+    """Loss and normal equations of all observations, from a prediction and its derivative."""
+    mesh, clouds, parts = problem.scenario.scene.mesh, problem.clouds, []
+    if clouds is not None:
+        distance, direction, *samples = _residuals(clouds, mesh, prediction, scale)
+        parts.append(_of_surface(mesh, slope, scale, distance, clouds.mask, -direction, *samples))
     if problem.markers is not None:
-        parts.append(_of_markers(problem.markers, seen, slope, scale))
+        parts.append(_of_markers(problem.markers, prediction, slope, scale))
     if problem.expected is not None:
-        parts.append(_of_expected(problem.expected, mesh, seen, slope, scale))
-    if problem.force is not None and seen.force is not None and slope.force is not None:
-        parts.append(_of_force(problem.force, seen.force, slope.force))
+        parts.append(_of_expected(problem.expected, mesh, prediction, slope, scale))
+    if not (problem.force is None or prediction.force is None or slope.force is None):
+        parts.append(_of_force(problem.force, prediction.force, slope.force))
     return NormalEquations(
-        loss=sum((part.loss for part in parts), jnp.zeros((), seen.x.dtype)),
+        loss=sum((part.loss for part in parts), jnp.zeros((), prediction.x.dtype)),
         spread=parts[0].spread,
         scores=jnp.concatenate([part.scores for part in parts]),
         matrices=jnp.concatenate([part.matrices for part in parts]),
@@ -94,34 +93,29 @@ def normal_equations_of(
     )
 
 
-def marker_distances(problem: Problem, seen: Prediction) -> tuple[Array, Array] | None:
-    """How far [m] each marker is from its place on the sheet, and where it was seen, by frame and
+def marker_distances(problem: Problem, prediction: Prediction) -> tuple[Array, Array] | None:
+    """Distance [m] of each marker from its place on the sheet, and where it was seen, by frame and
     marker; None without markers."""
     if problem.markers is None:
         return None
-    return length(_gaps(problem.markers, seen.x)), problem.markers.seen
+    return length(_gaps(problem.markers, prediction.x)), problem.markers.seen
 
 
-def point_distances(problem: Problem, seen: Prediction, scale: Scale = 0.0) -> tuple[Array, Array]:
-    """How far [m] each point is from the sheet, and which are no padding, by frame and point;
+def point_distances(
+    problem: Problem, prediction: Prediction, scale: Scale = 0.0
+) -> tuple[Array, Array]:
+    """Distance [m] of each point from the sheet, and which are no padding, by frame and point;
     empty without clouds. For `scale` [m] see `r2s.metrics.losses.robust`."""
     if problem.clouds is None:
-        return jnp.zeros((0, 0), seen.x.dtype), jnp.zeros((0, 0), bool)
+        return jnp.zeros((0, 0), prediction.x.dtype), jnp.zeros((0, 0), bool)
     mesh = problem.scenario.scene.mesh
-    return _residuals(problem.clouds, mesh, seen, scale)[0], problem.clouds.mask
-
-
-def _of_clouds(
-    clouds: Clouds, mesh: Mesh, seen: Prediction, slope: Sensitivity, scale
-) -> NormalEquations:
-    distance, direction, vertices, weights = _residuals(clouds, mesh, seen, scale)
-    return _of_surface(mesh, slope, scale, distance, clouds.mask, -direction, vertices, weights)
+    return _residuals(problem.clouds, mesh, prediction, scale)[0], problem.clouds.mask
 
 
 def _of_expected(
-    expected: ImageObservation, mesh: Mesh, seen: Prediction, slope: Sensitivity, scale
+    expected: ImageObservation, mesh: Mesh, prediction: Prediction, slope: Sensitivity, scale
 ) -> NormalEquations:
-    gap, counts = _to_clouds(expected, seen.x)
+    gap, counts = _to_clouds(expected, prediction.x)
     distance = length(gap)
     direction = gap / jnp.maximum(distance, TOUCHING)[..., None]
     shape = len(gap), *expected.vertices.shape
@@ -132,8 +126,8 @@ def _of_expected(
 def _of_surface(
     mesh: Mesh, slope: Sensitivity, scale, distance, mask, direction, vertices, weights
 ) -> NormalEquations:
-    """Of distances that grow as places of the sheet, by vertices and weights, move along
-    directions; all with leading axes (frame, point)."""
+    """From distances that grow as places of the sheet (vertices, weights) move along directions;
+    all with leading axes (frame, point)."""
     weight = _weights(distance, mask, scale)
 
     def frame(args):  # one at a time: its derivatives fit the cache
@@ -147,9 +141,11 @@ def _of_surface(
     return _of_robust(distance, mask, scale, *(_by_time(share) for share in shares))
 
 
-def _of_markers(markers: Markers, seen: Prediction, slope: Sensitivity, scale) -> NormalEquations:
+def _of_markers(
+    markers: Markers, prediction: Prediction, slope: Sensitivity, scale
+) -> NormalEquations:
     """Each marker is a cluster: an error of its place in the first frame is in all frames."""
-    gap = _gaps(markers, seen.x)
+    gap = _gaps(markers, prediction.x)
     distance = length(gap)
     picked = slope.x[:, markers.vertices]  # (frame, marker, corner, axis, theta)
     jacobian = jnp.einsum("mk,fmkiu->fmiu", markers.weights, picked)
@@ -229,10 +225,10 @@ def _by_time(shares: Float[Array, "frame patch *rest"]) -> Float[Array, " *clust
     return blocks.reshape(-1, *shares.shape[2:])
 
 
-def _residuals(clouds: Clouds, mesh: Mesh, seen: Prediction, scale: Scale):
+def _residuals(clouds: Clouds, mesh: Mesh, prediction: Prediction, scale: Scale):
     """`surface_residuals` of every frame; one frame at a time, which fits the cache.
 
-    There is slack at the borders where outliers are left out, since a small bias would show there.
+    There is slack at the borders where outliers are left out, against a small bias.
     """
     edges, slack = borders(mesh), jnp.minimum(scale, SLACK)
 
@@ -240,17 +236,14 @@ def _residuals(clouds: Clouds, mesh: Mesh, seen: Prediction, scale: Scale):
         points, mask, x = args
         return surface_residuals(points, mask, x, mesh.faces, edges, slack)
 
-    return jax.lax.map(frame, (clouds.points, clouds.mask, seen.x))
+    return jax.lax.map(frame, (clouds.points, clouds.mask, prediction.x))
 
 
 def _to_clouds(
     expected: ImageObservation, x: Float[Array, "frame vertex 3"]
 ) -> tuple[Float[Array, "frame sample 3"], Bool[Array, "frame sample"]]:
-    """From the nearest point of its cloud to each sample of the sheet [m], and which count.
-
-    Nothing counts in a frame without points. How far points are apart from each other says nothing
-    of the sheet: gaps are shorter by that.
-    """
+    """From the nearest point of its cloud to each sample of the sheet [m], less the distance of
+    neighbouring points; and which samples count, none in a frame without points."""
 
     def frame(args):
         x, targets, mask, apart, grippers = args
@@ -264,12 +257,12 @@ def _to_clouds(
         beyond = jnp.maximum(away - apart, 0) / jnp.maximum(away, TOUCHING)
         return jnp.where(counts[:, None], beyond[:, None] * gap, 0), counts
 
-    seen = expected.targets, expected.mask, expected.apart, expected.grippers
-    return jax.lax.map(frame, (x, *seen))
+    observed = expected.targets, expected.mask, expected.apart, expected.grippers
+    return jax.lax.map(frame, (x, *observed))
 
 
 def _gaps(markers: Markers, x: Float[Array, "frame vertex 3"]) -> Float[Array, "frame marker 3"]:
-    """From where markers were seen to where they should be [m]; zero where they were not seen."""
+    """From the observed to the predicted markers [m]; zero where they were not seen."""
     expected = jnp.einsum("mk,fmki->fmi", markers.weights, x[:, markers.vertices])
     return jnp.where(markers.seen[..., None], expected - markers.positions, 0)
 

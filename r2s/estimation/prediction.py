@@ -1,9 +1,9 @@
-"""What recordings would show if the sheet were of a given fabric, and the derivative of that.
+"""Predictions of recordings from a fabric, and their derivatives.
 
 `theta` is a flat vector: the fabric's place in its space; then the density of the sheet, that of
 the air and the sheet's size, which all recordings of a fabric share; then the cameras' shift, turn
 and clock of each recording. All but the place are nuisance parameters, in units of the standard
-deviation that `r2s.estimation.problem.NuisancePrior` gives them.
+deviations of `r2s.estimation.problem.NuisancePrior`.
 
 The motion is compiled apart from the loss: it is most of the work, and one program serves
 recordings of any number of points and all stages of a descent.
@@ -12,7 +12,6 @@ recordings of any number of points and all stages of a descent.
 import dataclasses
 import threading
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -47,11 +46,10 @@ def theta_indices(problems: Problems, which: int) -> np.ndarray:
 
 
 class FreeNuisance(NamedTuple):
-    """A nuisance parameter that the prior lets vary.
+    """A nuisance parameter with a prior standard deviation, `scale`, in its unit.
 
     - `recording`: its index, that of the first for what recordings share.
-    - `name`: one of `SHARED` or `OWN`. `scale`: its prior standard deviation, in its unit.
-    - `place`: its index in theta.
+    - `name`: one of `SHARED` or `OWN`. `place`: its index in theta.
     """
 
     recording: int
@@ -64,30 +62,30 @@ def free_nuisances(problems: Problems) -> Iterator[FreeNuisance]:
     """All nuisance parameters that vary, shared ones once."""
     known = set()
     for which, problem in enumerate(problems):
-        places = theta_indices(problems, which)[problem.space.dim :]
+        places = theta_indices(problems, which)[problem.space.dim :].tolist()
         rows = zip((*SHARED, *OWN), problem.nuisance_prior.scales, places, strict=True)
         for name, scale, place in rows:
             if scale and place not in known:
                 known.add(place)
-                yield FreeNuisance(which, name, float(scale), int(place))
+                yield FreeNuisance(which, name, float(scale), place)
 
 
 def nuisances(problems: Problems, theta: np.ndarray, deviation: np.ndarray) -> tuple[Nuisance, ...]:
     """The nuisance parameters that vary, from theta and its standard errors."""
-    found = []
-    for each in free_nuisances(problems):
-        number = f" {each.recording + 1}" if len(problems) > 1 else ""
-        at, spread = (each.scale * float(part[each.place]) for part in (theta, deviation))
-        if each.name in SHARED:  # the logarithm of a ratio
-            ratio = float(np.exp(at))
-            found.append(Nuisance(f"{each.name} ratio", "-", ratio, ratio * spread))
+    rows = []
+    for which, name, scale, place in free_nuisances(problems):
+        number = f" {which + 1}" if len(problems) > 1 else ""
+        value, error = scale * float(theta[place]), scale * float(deviation[place])
+        if name in SHARED:  # the logarithm of a ratio
+            ratio = float(np.exp(value))
+            rows.append(Nuisance(f"{name} ratio", "-", ratio, ratio * error))
         else:
-            found.append(Nuisance(each.name + number, UNITS[each.name], at, spread))
-    return tuple(found)
+            rows.append(Nuisance(name + number, UNITS[name], value, error))
+    return tuple(rows)
 
 
 class Prediction(eqx.Module):
-    """What a recording would show.
+    """The prediction of a recording.
 
     - `x`: vertices in the frame and on the clock of the cameras, at the frames that count, [m].
     - `force`: on the pulled clamp then, [N]; None: it was not measured.
@@ -118,7 +116,7 @@ def fabric_at(problem: Problem, theta: Theta) -> Fabric:
 
 
 def predict(problem: Problem, theta: Theta) -> Prediction:
-    """What the recording would show at a theta."""
+    """The prediction of a recording at a theta."""
     (x, force), ok = _move(problem, theta)
     return Prediction(_seen_from(problem, x, theta), force, ok)
 
@@ -126,13 +124,16 @@ def predict(problem: Problem, theta: Theta) -> Prediction:
 def sensitivities(
     problem: Problem, theta: Theta, width: float | None = None
 ) -> tuple[Prediction, Sensitivity]:
-    """What the recording would show at a theta, and its derivative.
+    """The prediction of a recording at a theta, and its derivative.
 
     The derivative is exact, by forward mode; or, with a `width`, the slope of the secant over that
-    much of every parameter's range, which does not see what is rougher.
+    much of every parameter's range, which averages over anything rougher.
     """
-    shared = problem.space.dim + len(SHARED)
-    index = jnp.array(_moving(problem))
+    dim, prior = problem.space.dim, problem.nuisance_prior
+    shared = dim + len(SHARED)
+    scales = (prior.density, prior.air, prior.size)
+    # of the parameters that change the motion
+    index = jnp.array([*range(dim), *(dim + i for i, scale in enumerate(scales) if scale)])
 
     def moved(change):
         return _move(problem, theta.at[index].add(change))
@@ -140,6 +141,9 @@ def sensitivities(
     def moved_twice(change):
         out = moved(change)
         return out[0], out
+
+    def scattered(part):
+        return jnp.zeros((*part.shape[:-1], len(theta)), part.dtype).at[..., index].set(part)
 
     def seen_from(x):
         return _seen_from(problem, x, theta)
@@ -151,28 +155,14 @@ def sensitivities(
         none = jnp.zeros(len(index), theta.dtype)
         slope, ((x, force), ok) = jax.jacfwd(moved_twice, has_aux=True)(none)
     else:
-        slope, ((x, force), ok) = _secants(moved, theta[index], width, problem.space.dim)
-    slope_x, slope_force = jax.tree.map(partial(_scattered, len(theta), index), slope)
+        slope, ((x, force), ok) = _secants(moved, theta[index], width, dim)
+    slope_x, slope_force = jax.tree.map(scattered, slope)
     slope_x = jax.vmap(turned, in_axes=-1, out_axes=-1)(slope_x[..., :shared])
     own = jax.jacfwd(lambda theta: _seen_from(problem, x, theta))(theta)[..., shared:]
     return (
         Prediction(seen_from(x), force, ok),
         Sensitivity(jnp.concatenate([slope_x, own], axis=-1), slope_force),
     )
-
-
-def _moving(problem: Problem) -> list[int]:
-    """Indices in theta of what changes the motion: the fabric, and the density of sheet and air
-    and the sheet's size where the prior lets them vary."""
-    dim, prior = problem.space.dim, problem.nuisance_prior
-    scales = (prior.density, prior.air, prior.size)
-    shared = [dim + i for i, scale in enumerate(scales) if scale]
-    return [*range(dim), *shared]
-
-
-def _scattered(length: int, index: Array, part: Array) -> Array:
-    """Derivatives in some parameters, with zeros for the others along the last axis."""
-    return jnp.zeros((*part.shape[:-1], length), part.dtype).at[..., index].set(part)
 
 
 def _secants(moved, place, width: float, dim: int):
@@ -210,65 +200,46 @@ def derivatives_at(problems: Problems, theta: Theta, width: float | None = None)
 
 
 def _motions(problems: Problems, theta: Theta) -> list[tuple[Problem, Array]]:
-    """What moves in each recording, and its own part of theta."""
+    """The motion of each recording, and its own part of theta."""
     indices = (jnp.asarray(theta_indices(problems, i)) for i in range(len(problems)))
     pairs = zip(problems, indices, strict=True)
     return [(motion_alone(problem), theta[index]) for problem, index in pairs]
 
 
-class _Known(NamedTuple):
-    """Derivatives of a scenario over some frames, at a theta, by slopes over a width."""
-
-    scenario: Scenario
-    theta: np.ndarray
-    width: float | None
-    frames: int
-    derivatives: tuple[Prediction, Sensitivity]
-
-    def is_of(self, scenario: Scenario, theta: np.ndarray, width: float | None) -> bool:
-        is_alike = self.scenario is scenario and self.width == width
-        return is_alike and np.array_equal(self.theta, theta)
-
-    @property
-    def bytes(self) -> int:
-        return sum(leaf.nbytes for leaf in jax.tree.leaves(self.derivatives))
-
-
 def remembering() -> Derive:
-    """`derivatives_at` with a cache of the latest places.
-
-    Every stage of a descent, every search and the standard errors begin where another ended.
-    Derivatives of more frames serve fewer, too.
-    """
-    cache: list[_Known] = []  # the latest place last
+    """`derivatives_at` with a cache of the latest places: a stage of a descent, a search and the
+    standard errors begin where another ended. Derivatives of more frames serve fewer, too."""
+    # by scenario, theta and width, the latest last: the scenario, the number of frames, derivatives
+    cache: dict[tuple, tuple[Scenario, int, tuple[Prediction, Sensitivity]]] = {}
     lock = threading.Lock()
 
     def derive(problems: Problems, theta: Theta, width: float | None = None) -> Predicted:
         return thread_map(lambda pair: one(*pair, width), _motions(problems, theta))
 
     def one(problem: Problem, theta: Array, width: float | None):
-        frames = problem.scenario.num_frames if problem.wanted is None else int(problem.wanted)
-        place = np.asarray(theta)
+        scenario = problem.scenario  # kept, so that no other has its id
+        frames = scenario.num_frames if problem.wanted is None else int(problem.wanted)
+        key = id(scenario), np.asarray(theta).tobytes(), width
         with lock:
-            found = next((k for k in cache if k.is_of(problem.scenario, place, width)), None)
-        if found is None or found.frames < frames:
-            derivatives = _sensitivities(problem, theta, width)
-            found = _Known(problem.scenario, place, width, frames, derivatives)
+            known = cache.get(key)
+        if known is None or known[1] < frames:
+            known = scenario, frames, _sensitivities(problem, theta, width)
         with lock:
-            cache[:] = [k for k in cache if not k.is_of(problem.scenario, place, width)]
-            cache.append(found)
-            while len(cache) > 1 and sum(each.bytes for each in cache) > REMEMBERED:
-                del cache[0]
-        return found.derivatives
+            cache.pop(key, None)
+            cache[key] = known
+            while len(cache) > 1 and sum(map(_bytes, cache.values())) > REMEMBERED:
+                del cache[next(iter(cache))]
+        return known[2]
 
     return derive
 
 
-def explain(problem: Problem, theta: Theta) -> str:
-    """Say why the run at a theta fails, in which frame and step; "" where it does not.
+def _bytes(known: tuple[Scenario, int, tuple[Prediction, Sensitivity]]) -> int:
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(known[2]))
 
-    It is simulated once more: for an error, not for a search.
-    """
+
+def explain(problem: Problem, theta: Theta) -> str:
+    """Why the run at a theta, simulated once more, fails, in which frame and step; or ""."""
     scenario, fabric, solver = _conditions(problem, theta)
     return eqx.filter_jit(rollout)(scenario, fabric, solver=solver).explain()
 
@@ -292,9 +263,9 @@ def _move(problem: Problem, theta: Theta):
     if problem.force is None:
         moved = rollout(scenario, fabric, solver=solver, frames=problem.wanted)
         return (moved.x, None), jnp.all(moved.ok)
-    found = energy_balance(scenario, fabric, solver=solver)
-    force = clamp_force(scenario, found)[jnp.array(problem.frames)]
-    return (found.x, force @ problem.force.directions.T), jnp.all(jnp.isfinite(found.x))
+    balance = energy_balance(scenario, fabric, solver=solver)
+    force = clamp_force(scenario, balance)[jnp.array(problem.frames)]
+    return (balance.x, force @ problem.force.directions.T), jnp.all(jnp.isfinite(balance.x))
 
 
 def _seen_from(problem: Problem, x: Float[Array, "all 3"] | Array, theta: Theta):
@@ -312,13 +283,13 @@ def _seen_from(problem: Problem, x: Float[Array, "all 3"] | Array, theta: Theta)
 def _delayed(x: Float[Array, "all vertex 3"], delay: Float[Array, ""]) -> Array:
     """The motion `delay` frames earlier, by cubic interpolation (Catmull and Rom 1974).
 
-    A camera whose clock is late shows at a time on it what was earlier. At rest beyond the ends.
+    A frame of a camera whose clock is late is of an earlier time. At rest beyond the ends.
     """
     places = jnp.arange(x.shape[0]).astype(x.dtype) - delay
     whole = jax.lax.stop_gradient(jnp.floor(places))
     part = (places - whole)[:, None, None]
     steps = [jnp.clip(whole.astype(int) + step, 0, x.shape[0] - 1) for step in (-1, 0, 1, 2)]
-    before, here, there, after = (x[step] for step in steps)
-    slope, curve = (there - before) / 2, before - 2.5 * here + 2 * there - after / 2
-    twist = (after - before) / 2 + 1.5 * (here - there)
-    return here + part * (slope + part * (curve + part * twist))
+    before, left, right, after = (x[step] for step in steps)
+    slope, curve = (right - before) / 2, before - 2.5 * left + 2 * right - after / 2
+    twist = (after - before) / 2 + 1.5 * (left - right)
+    return left + part * (slope + part * (curve + part * twist))

@@ -26,15 +26,16 @@ from r2s.recordings.recording import (
     subsample,
 )
 from r2s.recordings.views import Views
+from r2s.scenarios.resolution import mpm_cloth
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
 
 POINTS = 300  # at most, of a cloud
 TARGETS = 1200  # at most, of a cloud that the sheet must lie near
 SPACING = 0.012  # [m], of the samples of such a sheet
 ON_SHEET = 0.01  # [m], within which a marker must lie in the first frame
-BETWEEN = 3  # frames after the last that is seen, for the interpolation in time
+BETWEEN = 3  # frames after the last observed one, for the interpolation in time
 CLOCK = 4.0  # standard deviations, by which a clock may be early
-# of each kind of observation: its field that says where
+# the mask of each kind of observation
 MASKS = {"clouds": "mask", "markers": "seen", "force": "seen", "expected": "mask"}
 FORCE_SCALE = 0.02  # [m/N]: a load cell is good to 10 mN where a marker is to 0.2 mm
 ROUNDS = 60  # of the registration of a hanging sheet
@@ -42,17 +43,15 @@ SMOOTH, STRETCHED = 0.02, 0.1  # weights of neighbours moving apart, and of edge
 
 
 class NuisancePrior(NamedTuple):
-    """Standard deviations of what was written down of an experiment; 0: it is exact.
+    """Standard deviations of the recorded conditions of an experiment; 0: exact.
 
-    They are estimated along with the fabric, so that an error of calibration is not taken for a
-    property of the fabric.
+    Their errors are estimated along with the fabric, so that they do not bias it.
 
-    - `shift`: of the cameras' frame against the grippers', [m]; of each axis, or of all alike.
+    - `shift`: of the cameras' frame against the grippers', [m]; of each axis, or one for all.
     - `turn`: of the same, about the vertical through the first gripper, [rad].
     - `time`: delay of the cameras' clock behind the grippers', [s].
-    - `density`: of the sheet, where it was not weighed, relative.
+    - `density`, `size`: of the sheet (its side length), relative.
     - `air`: of the force of the air at its speed (its density, its drag), relative.
-    - `size`: of the sheet's side length, where it was not measured, relative.
     """
 
     shift: float | tuple[float, float, float] = 0.015
@@ -74,22 +73,21 @@ class NuisancePrior(NamedTuple):
 
 
 USUAL = NuisancePrior()
-WIND = 0.1  # of the wind's force: 5 % of its speed, or as much as is known of a fabric's drag
-# nuisances that all recordings of a fabric share
-SHARED: tuple[str, ...] = ("density", "air", "size")
-OWN: tuple[str, ...] = ("shift x", "shift y", "shift z", "turn", "time")  # nuisances of each
+WIND = 0.1  # of the wind's force: 5 % of its speed, or the uncertainty of a fabric's drag
+SHARED: tuple[str, ...] = ("density", "air", "size")  # nuisances of all recordings of a fabric
+OWN: tuple[str, ...] = ("shift x", "shift y", "shift z", "turn", "time")  # of each recording
 UNITS = {"shift x": "m", "shift y": "m", "shift z": "m", "turn": "rad", "time": "s"}
 
 
 def default_nuisance_prior(
     scenario: Scenario, doubt: MeasurementUncertainty | None = None
 ) -> NuisancePrior:
-    """What is in doubt of a recording: the cameras' place, and the force of a wind that blows.
+    """The nuisances of a recording: the cameras' place, and the force of a wind.
 
-    `doubt`: what the recording says of its own, of the air too; None: the usual.
+    `doubt`: the recording's own standard deviations; None: the usual ones.
 
-    A sheet in wind weighs the air against its density to a part in five thousand. Were both taken
-    as exact, an error of 1 % in either could be explained by half the stiffness.
+    A sheet in wind determines the ratio of air to density to a part in five thousand. Were both
+    exact, an error of 1 % in either could be explained by half the stiffness.
     """
     own = USUAL if doubt is None else NuisancePrior(doubt.shift, doubt.turn, doubt.time)
     size, air = (0.0, 0.0) if doubt is None else (doubt.size, doubt.air)
@@ -113,13 +111,13 @@ class Markers(eqx.Module):
 
 
 class ImageObservation(eqx.Module):
-    """Where the sheet itself must lie near the clouds: in its parts that cameras had in view.
+    """Samples of the sheet that must lie near the clouds where cameras see them.
 
-    - `views`: the cameras, and what became of their points.
+    - `views`: the cameras, and the processing of their points.
     - `vertices`, `weights`: samples of the sheet, off its borders.
     - `grippers`: in the frames that count, [m].
     - `targets`, `mask`: denser clouds of these frames, [m], and which points are no padding.
-    - `apart`: how far a place among the points of a frame is from the nearest at most, [m].
+    - `apart`: largest distance of a place among the points of a frame from the nearest, [m].
     """
 
     views: Views = eqx.field(static=True)
@@ -145,13 +143,13 @@ class Problem(eqx.Module):
     - `scenario`: how the sheet is held and moved.
     - `space`: the fabrics to choose from.
     - `frames`: which frames of the scenario count.
-    - `clouds`, `markers`, `force`: what was seen in them; None: it was not.
-    - `expected`: what must have been seen of the sheet; None: nobody knows the cameras.
+    - `clouds`, `markers`, `force`: the observations in them; None: there are none.
+    - `expected`: which parts of the sheet must be observed; None: the cameras are unknown.
     - `wanted`: how many frames of the scenario have to be simulated; None: all.
     - `weight`: of a frame beside those of other recordings of the fabric, [1/m^2] (only ratios
-      count): what the square of a distance scatters by, inverted; None: 1, as of all.
-    - `solver`: what simulates; None: the cloth.
-    - `nuisance_prior`: how far the experiment may be off what was written down.
+      count): one over the variance of a distance; None: 1, of all recordings.
+    - `solver`: None: the cloth.
+    - `nuisance_prior`: standard deviations of the recorded conditions.
     """
 
     scenario: Scenario
@@ -168,7 +166,7 @@ class Problem(eqx.Module):
 
     @property
     def is_pulled(self) -> bool:
-        """Whether it is a pull whose force was recorded: a taut sheet, which moves smoothly."""
+        """Whether it is a pull whose force was recorded: a taut sheet."""
         return self.force is not None
 
     @classmethod
@@ -183,10 +181,7 @@ class Problem(eqx.Module):
         nuisance_prior: NuisancePrior | None = None,
         as_seen: bool = True,
     ) -> "Problem":
-        """The problem of a recording.
-
-        Tracked markers replace the clouds, and the force on the pulled clamp counts where it was
-        measured.
+        """The problem of a recording: from tracked markers, else clouds, and a pull's force.
 
         - `num_points`, `seed`: how clouds are thinned (`r2s.recordings.recording.subsample`).
         - `shape`: vertices of the simulated sheet along warp and weft.
@@ -223,6 +218,27 @@ class Problem(eqx.Module):
 Problems = tuple[Problem, ...]
 
 
+def problems_on_mpm(
+    recordings: Sequence[Recording], space: ParameterSpace, shape: tuple[int, int]
+) -> Problems:
+    """The problems of recordings, simulated by material points of a mesh of `shape` vertices,
+    stable for all of the space.
+
+    The sheet's size is exact, since points are laid out for one size. A sheet that hangs starts
+    flat: points do not settle into the shape of its first cloud.
+    """
+    stiffest = space(jnp.ones(space.dim, float))  # limits the time step
+    problems = []
+    for recording in recordings:
+        problem = Problem.make(recording, space, shape=shape, as_seen=False)
+        sheet = mpm_cloth(problem.scenario, stiffest)
+        background = dataclasses.replace(sheet.background, forward_mode=False)
+        exact_size = problem.nuisance_prior._replace(size=0.0)
+        solver = dataclasses.replace(sheet, background=background)
+        problems.append(dataclasses.replace(problem, solver=solver, nuisance_prior=exact_size))
+    return tuple(problems)
+
+
 def read_by_problem(recording: Recording) -> DataRequirements:
     """What `Problem.make` reads of a recording."""
     has_markers = recording.markers is not None
@@ -236,63 +252,60 @@ def read_by_problem(recording: Recording) -> DataRequirements:
 
 
 def check_shared(problems: Sequence[Problem]) -> None:
-    """Raise `ValueError` when recordings are in doubt of what they share by unlike deviations: in
-    their units one number would mean two things. One that takes it as exact may be among them."""
-    for name, scales in zip(
-        SHARED, zip(*(p.nuisance_prior.scales for p in problems), strict=True), strict=False
-    ):
-        if len(found := {scale for scale in scales if scale}) > 1:
+    """Raise `ValueError` when recordings have different standard deviations, other than 0, of a
+    nuisance that they share."""
+    for i, name in enumerate(SHARED):
+        scales = {problem.nuisance_prior.scales[i] for problem in problems} - {0}
+        if len(scales) > 1:
             raise ValueError(
-                f"the {name} of a fabric is in doubt by {sorted(found)} in recordings that are "
+                f"the {name} of a fabric is in doubt by {sorted(scales)} in recordings that are "
                 "estimated from together: give one deviation"
             )
 
 
 def motion_alone(problem: Problem) -> Problem:
-    """The problem without what was seen, on which no prediction depends but for its end.
+    """The problem without its observations, on which no prediction depends but for its end.
 
-    Without a force it is not simulated beyond the last frame of which something was seen.
+    Without a force it is not simulated beyond the last observed frame.
     """
     wanted = None if problem.force is not None else _wanted(problem)
-    seen = dict.fromkeys(("clouds", "markers", "expected", "weight"))
-    return dataclasses.replace(problem, wanted=wanted, **seen)
+    observed = dict.fromkeys(("clouds", "markers", "expected", "weight"))
+    return dataclasses.replace(problem, wanted=wanted, **observed)
 
 
 def _wanted(problem: Problem) -> Int[Array, ""]:
-    """How many frames are seen or lie between those that are, on the cameras' clock."""
-    parts = [
-        jnp.any(mask.reshape(len(mask), -1), axis=1)
-        for part, name in ((problem.clouds, "mask"), (problem.markers, "seen"))
-        if (mask := getattr(part, name, None)) is not None
-    ]
-    if not parts:
+    """The number of frames up to the last observed one, on the cameras' clock."""
+    masks = []
+    if problem.clouds is not None:
+        masks.append(jnp.any(problem.clouds.mask, axis=1))
+    if problem.markers is not None:
+        masks.append(jnp.any(problem.markers.seen, axis=1))
+    if not masks:
         return jnp.asarray(problem.scenario.num_frames)
-    seen = jnp.any(jnp.stack(parts), axis=0)
-    last = jnp.max(jnp.where(seen, jnp.array(problem.frames), 0))
+    last = jnp.max(jnp.where(jnp.any(jnp.stack(masks), axis=0), jnp.array(problem.frames), 0))
     late = CLOCK * problem.nuisance_prior.time / problem.scenario.interval
     return jnp.minimum(last + BETWEEN + math.ceil(late), problem.scenario.num_frames)
 
 
 def beginning(problem: Problem, share: float) -> Problem:
-    """The problem with nothing seen after a share of the frames in which something was seen.
+    """The problem with the observations of the first share of the observed frames, at least one.
 
-    At least one frame is kept. Its arrays have the same shapes, so that what is compiled for the
-    problem serves this one.
+    Its arrays have the same shapes, so that the programs compiled for the problem serve this one.
     """
 
-    def first_ones(seen: Bool[Array, " frame"]) -> Bool[Array, " frame"]:
+    def first(seen: Bool[Array, " frame"]) -> Bool[Array, " frame"]:
         number = jnp.cumsum(seen).astype(float)
         return number <= jnp.maximum(jnp.round(share * number[-1]), 1)
 
-    return seen_where(problem, first_ones)
+    return seen_where(problem, first)
 
 
 def seen_where(
     problem: Problem, chosen: Callable[[Bool[Array, " frame"]], Bool[Array, " frame"]]
 ) -> Problem:
-    """The problem with nothing seen but in some frames, in arrays of the same shapes.
+    """The problem with the observations of some frames alone, in arrays of the same shapes.
 
-    `chosen`: which these are, from those in which something of a kind was seen.
+    `chosen`: the mask of these, from that of the observed frames of a kind.
     """
     kept = {}
     for name, mask in MASKS.items():
@@ -307,13 +320,13 @@ def seen_where(
 def _expected(
     recording: Recording, scenario: Scenario, frames: slice, seed: int
 ) -> ImageObservation | None:
-    """What must be seen of the sheet of a recording whose cameras are known."""
+    """The `ImageObservation` of a recording whose cameras are known."""
     views, mesh = recording.info.views, scenario.scene.mesh
     if views is None:
         return None
     size = np.max(np.asarray(mesh.rest), axis=0)
-    around = [np.arange(views.border + SPACING / 2, side - views.border, SPACING) for side in size]
-    places = np.stack(np.meshgrid(*around, indexing="ij"), axis=-1).reshape(-1, 2)
+    axes = [np.arange(views.border + SPACING / 2, side - views.border, SPACING) for side in size]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     if not len(places):
         raise ValueError(
             f"{recording.info.name}: a sheet of {size} m has no place off a border of "
@@ -329,10 +342,8 @@ def _expected(
 
 
 def _apart(cloud: Float[np.ndarray, "point 3"]) -> float:
-    """How far [m] a random place on a sheet is from the nearest point of its cloud, at most.
-
-    On average it is as far as points are from each other; seldom twice as far.
-    """
+    """Twice the mean distance [m] of neighbours: hardly any place on a sheet is farther from the
+    nearest point of its cloud."""
     if len(cloud) < 2:
         return 0.0
     return 2 * float(np.mean(KDTree(cloud).query(cloud, 2)[0][:, 1]))
@@ -342,17 +353,14 @@ def _markers(recording: Recording, mesh: Mesh, frames: slice) -> Markers | None:
     """The markers at their places on the sheet, or else where the first frame shows them on it."""
     if recording.markers is None or recording.markers_seen is None:
         return None
+    sheet, seen = recording.info.sheet, recording.markers_seen
     if recording.marker_places is not None:
         face, weights, _ = _on_sheet(np.asarray(recording.marker_places), mesh)
-        seen = recording.markers_seen[frames]
-        return Markers(recording.markers[frames], seen, mesh.faces[face], weights)
-    sheet, seen = recording.info.sheet, np.asarray(recording.markers_seen)
-    if not seen[0].all():
-        lost = np.flatnonzero(~seen[0]).tolist()
-        raise ValueError(f"{recording.info.name}, frame 0: markers {lost} are not seen at rest")
+        return Markers(recording.markers[frames], seen[frames], mesh.faces[face], weights)
+    if hidden := np.flatnonzero(~np.asarray(seen[0])).tolist():
+        raise ValueError(f"{recording.info.name}, frame 0: markers {hidden} are not seen at rest")
     offset = np.asarray(recording.markers[0]) - np.asarray(sheet.origin)
-    material = offset @ np.array([sheet.warp, sheet.weft]).T
-    face, weights, away = _on_sheet(material, mesh)
+    face, weights, away = _on_sheet(offset @ np.array([sheet.warp, sheet.weft]).T, mesh)
     if away.max() > ON_SHEET:
         worst = int(away.argmax())
         raise ValueError(
@@ -360,44 +368,43 @@ def _markers(recording: Recording, mesh: Mesh, frames: slice) -> Markers | None:
             "the sheet: check the sheet's size and place [m] and the markers' plane, or leave the "
             "marker out if it is on another cloth"
         )
-    return Markers(recording.markers[frames], jnp.asarray(seen[frames]), mesh.faces[face], weights)
+    return Markers(recording.markers[frames], seen[frames], mesh.faces[face], weights)
 
 
 def _on_sheet(
     places: Float[np.ndarray, "place 2"], mesh: Mesh
 ) -> tuple[Int[Array, " place"], Float[Array, "place 3"], Float[np.ndarray, " place"]]:
-    """The faces of places on a sheet [m], their weights, and how far off the sheet they are [m]."""
+    """The faces of places on a sheet [m], their weights, and their distances from the sheet [m]."""
     flat, rest = (jnp.pad(jnp.asarray(at, float), ((0, 0), (0, 1))) for at in (places, mesh.rest))
     face, weights = nearest(flat, rest, mesh.faces)
-    there = np.einsum("pk,pki->pi", weights, np.asarray(mesh.rest)[np.asarray(mesh.faces)[face]])
-    return face, weights, np.linalg.norm(there - places, axis=1)
+    foot = np.einsum("pk,pki->pi", weights, np.asarray(mesh.rest)[np.asarray(mesh.faces)[face]])
+    return face, weights, np.linalg.norm(foot - places, axis=1)
 
 
 def force_at(recording: Recording, frames: slice | list[int]) -> Force | None:
     """The force at some frames, None where none was measured; a log of numbers is along the warp,
     along which the clamp pulls.
 
-    Raises `ValueError` for a log that does not cover the frames, and for one number that falls in a
-    stretching.
+    Raises `ValueError` for a log that does not cover the frames, and for a force along the pull
+    that is negative in a stretching.
     """
     if recording.force is None or recording.force_times is None:
         return None
-    log = np.asarray(recording.force, float)
-    scalar = log.ndim == 1
-    times = np.asarray(recording.times)[frames]
-    columns = log[:, None] if scalar else log
-    clock = np.asarray(recording.force_times)
+    info, log = recording.info, np.asarray(recording.force, float)
+    times, clock = np.asarray(recording.times)[frames], np.asarray(recording.force_times)
     try:
         check_covered(clock, times)
     except ValueError as error:
-        raise ValueError(f"{recording.info.name}: {error}") from error
-    values = np.stack([np.interp(times, clock, column) for column in columns.T], axis=1)
-    if scalar and recording.info.scenario == "stretching" and -values.min() > values.max():
+        raise ValueError(f"{info.name}: {error}") from error
+    columns = np.atleast_2d(log.T)
+    values = np.stack([np.interp(times, clock, column) for column in columns], axis=1)
+    scalar = log.ndim == 1
+    if scalar and info.scenario == "stretching" and -values.min() > values.max():
         raise ValueError(
-            f"{recording.info.name}: the force on the pulled clamp falls to {values.min():.3g} N: "
-            "it must be positive along the pull"
+            f"{info.name}: the force on the pulled clamp falls to {values.min():.3g} N: it must be "
+            "positive along the pull"
         )
-    directions = np.array([recording.info.sheet.warp]) if scalar else np.eye(3)
+    directions = np.array([info.sheet.warp]) if scalar else np.eye(3)
     seen = jnp.ones(len(values), bool)
     return Force(jnp.asarray(values, float), seen, jnp.asarray(directions, float))
 
@@ -411,15 +418,13 @@ def start_as_seen(
     points: Float[Array, "point 3"],
     mask: Bool[Array, " point"],
 ) -> Scenario:
-    """A scenario of a hanging sheet that starts in the shape of its first cloud.
+    """A scenario of a hanging sheet that starts in the shape of its first cloud (`points` [m]).
 
     A sheet whose corners are nearer to each other than they were cut buckles in one of several
-    shapes, each at rest. Which one a simulation falls into depends on the fabric, and no descent
+    shapes, each at rest. Which one a simulation ends in depends on the fabric, and no descent
     crosses such a jump; near the observed shape, more fabrics come to rest in it (not all: for a
-    stiff denim it fails on some recordings).
-
-    - `fabric`: any of those to be estimated, for what the cloud does not show.
-    - `points`, `mask`: the first cloud, [m].
+    stiff denim it fails on some recordings). `fabric`: any of those to be estimated, for the parts
+    that the cloud does not show.
     """
     scene = scenario.scene
     first = _rollout(dataclasses.replace(scenario, num_frames=1), fabric).x[0]
@@ -436,11 +441,8 @@ def registered(
     mesh: Mesh,
     free: Bool[Array, " vertex"],
 ) -> Float[Array, "vertex 3"]:
-    """The vertices of a sheet laid smoothly onto points, with edges as long as they were.
-
-    - `points`, `mask`: where to, [m].
-    - `x`: vertices at first, [m].
-    - `free`: which vertices move.
+    """The vertices `x` [m] of a sheet laid smoothly onto points [m], with edges as long as they
+    were; only `free` vertices move.
 
     Nonrigid iterative closest points (Amberg, Romdhani and Vetter 2007), with distances to the
     surface, and outliers down-weighted.
@@ -468,7 +470,7 @@ def registered(
 
 
 def _edges(mesh: Mesh, count: int) -> Float[Array, "edge vertex"]:
-    """The matrix from vertices to the edges of the faces; inner edges are there twice."""
+    """The matrix from vertices to the edges of the faces; inner edges count twice."""
     corner = jax.nn.one_hot(mesh.faces, count, dtype=float)
     return (corner - jnp.roll(corner, 1, axis=1)).reshape(-1, count)
 

@@ -22,11 +22,14 @@ from r2s.cli.estimate import EstimateCard  # noqa: E402
 from r2s.cli.estimate_report import Outcome, approach, assumed  # noqa: E402
 from r2s.cli.main import main  # noqa: E402
 from r2s.estimation import cards
-from r2s.estimation.baselines import MASS, STRETCH  # noqa: E402
 from r2s.estimation.cards import Card, Provenance  # noqa: E402
 from r2s.estimation.estimate import point_estimate  # noqa: E402
 from r2s.estimation.method import default_space  # noqa: E402
-from r2s.estimation.methods import METHODS  # noqa: E402
+from r2s.estimation.methods import (  # noqa: E402
+    MASS,
+    METHODS,  # noqa: E402
+    STRETCH,
+)
 from r2s.materials import presets  # noqa: E402
 from r2s.materials.arcsim import read_material  # noqa: E402
 from r2s.materials.parameters import InformedSpace  # noqa: E402

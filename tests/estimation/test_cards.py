@@ -15,7 +15,7 @@ from hypothesis import given
 
 from r2s.estimation import cards
 from r2s.estimation.cards import Card, Provenance
-from r2s.estimation.estimate import Estimate, Nuisance
+from r2s.estimation.estimate import Estimate, Nuisance, point_estimate
 from r2s.materials import presets
 from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
@@ -39,19 +39,12 @@ def estimate_at(place, deviations, loss=1e-6) -> Estimate:
     dim = FAMILY.dim
     correlation = np.eye(dim)
     correlation[0, 1] = correlation[1, 0] = -0.999999
-    return Estimate(
-        approach="diffcloud",
-        fabric=FAMILY(place),
-        ranges=FAMILY.ranges,
-        values=np.asarray(FAMILY.values(place)),
+    history = np.ones((3, 2)), np.ones((3, 2, dim))
+    return dataclasses.replace(
+        point_estimate("diffcloud", FAMILY, place, loss, *history, 1.5, converged=True),
         standard_errors=np.asarray(deviations, float),
         correlation=correlation,
         nuisances=(Nuisance("shift x", "m", 0.001, np.nan),),
-        loss=loss,
-        losses=np.ones((3, 2)),
-        history=np.ones((3, 2, dim)),
-        seconds=1.5,
-        converged=True,
     )
 
 

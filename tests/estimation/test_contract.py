@@ -17,12 +17,9 @@ from known_ends import SPACE as ISOTROPIC
 from r2s.estimation import cards
 from r2s.estimation.checkpoint import arrays_of, load, read, save, tree_from
 from r2s.estimation.estimate import as_json, from_json, point_estimate
-from r2s.estimation.method import Budget, default_space, seed_of
+from r2s.estimation.method import Budget, default_space
 from r2s.estimation.methods import METHODS
-from r2s.estimation.pinn import published_recipe, training
 from r2s.estimation.summary import describe
-from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
-from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
 
 DATA = TESTS / "data"
 TINY = {
@@ -65,25 +62,11 @@ def test_what_is_not_supported_is_refused_with_a_reason(recording, name, solver,
         method.estimate([recording] * number, SPACE, key=jr.key(0))
 
 
-def test_the_network_takes_no_lift_beside_a_pull(recording):
-    pull = dataclasses.replace(
-        recording, info=dataclasses.replace(recording.info, scenario="stretching")
-    )
-    with pytest.raises(ValueError, match="pinn: .* so the PINN estimates from stretchings alone"):
-        METHODS["pinn"]().estimate([pull, recording], SPACE, key=jr.key(0))
-
-
 def test_every_method_supports_a_solver_and_says_why_not_the_other():
     for method in METHODS.values():
         assert method.supports
         for solver in ("cloth", "mpm"):
             assert method.refusal(solver, "stretching") == "" or method.refusals[solver]
-
-
-def test_the_space_is_that_of_the_solver_and_a_key_has_a_seed():
-    assert isinstance(default_space("cloth", 0.2), OrthotropicSpace)
-    assert isinstance(default_space("mpm", 0.2), IsotropicSpace)
-    assert seed_of(jax.random.key(7)) == 7
 
 
 def test_physnet_needs_a_file_for_its_network(recording):
@@ -131,6 +114,7 @@ def test_other_methods_keep_the_contract(recording, name, solver):
     space = default_space(solver, float(FABRIC.density))
     found = ran(name, recording, space, solver)
     assert found.approach.startswith(name) and np.isfinite(found.loss) and not found.converged
+    assert not name.endswith("published") or found.loss <= found.losses[0, 0]
 
 
 @pytest.mark.slow(group="estimates")
@@ -188,15 +172,6 @@ def test_the_network_takes_a_stretching(name):
         (1 / 30, 1 / 3, "upper"),
         (3.0, 30.0, "lower"),
         (1 / 10, 10.0, None),
-        pytest.param(
-            1 / 30,
-            1 / 10,
-            "upper",
-            marks=pytest.mark.xfail(
-                reason="so far away the misfit counts as noise, and the prior holds it inside",
-                strict=True,
-            ),
-        ),
     ],
 )
 def test_a_descent_that_arrives_has_converged_and_a_truth_beyond_a_bound_is_named(low, high, bound):
@@ -240,15 +215,8 @@ def test_an_estimate_of_version_0_2_0_is_read():
     again = from_json(as_json(found))
     np.testing.assert_array_equal(again.values, found.values)
     assert as_json(again)["format"] == "r2s-estimate/4"
-
-
-@pytest.mark.parametrize(
-    "approach, converged",
-    [("pinn (1 pull, not converged)", False), ("pinn (1 pull)", True), ("diffcp", None)],
-)
-def test_version_0_2_0_said_in_words_whether_it_had_converged(approach, converged):
-    stored = json.loads((DATA / "estimate_0.2.0.json").read_text())
-    assert from_json({**stored, "approach": approach}).converged is converged
+    for words, converged in (("pinn (1 pull, not converged)", False), ("pinn (1 pull)", True)):
+        assert from_json({**stored, "approach": words}).converged is converged
 
 
 def test_a_card_of_version_0_2_0_is_read(tmp_path):
@@ -263,16 +231,6 @@ def test_a_card_of_version_0_2_0_is_read(tmp_path):
     del stored["estimate"]["conditions"]
     with pytest.raises(ValueError, match="estimate: missing: conditions"):
         cards.from_json(stored)
-
-
-def test_an_estimate_and_a_card_have_one_form_of_a_fabric():
-    found = point_estimate("test", SPACE, jnp.full(7, 0.4), 0.0, np.zeros(1), np.zeros(1), 0.0)
-    form = fabric_as_json(found.fabric)
-    assert as_json(found)["fabric"] == form
-    card = cards.as_json(cards.Card.make("any", found, cards.Provenance("made up")))
-    assert card["fabric"] == form == card["estimate"]["fabric"]
-    assert form["membrane"]["c12"].keys() == {"value", "unit"}
-    assert float(fabric_from_json(form).membrane.c12) == float(found.fabric.membrane.c12)
 
 
 def test_a_checkpoint_is_of_one_run(tmp_path):
@@ -295,8 +253,3 @@ def test_a_checkpoint_is_of_one_run(tmp_path):
     np.savez(path, places=np.zeros(2))
     with pytest.raises(ValueError, match=r"run\.npz is no checkpoint"):
         read(path)
-
-
-def test_the_usual_budgets_of_the_network_are_those_of_its_recipes():
-    assert METHODS["pinn"].budget.max_iterations == training.Recipe().adam
-    assert METHODS["pinn-published"].budget.max_iterations == published_recipe.EPOCHS

@@ -7,19 +7,19 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from known_ends import FABRIC, short_lift
+from known_ends import FABRIC, end_at, short_lift
 
-from r2s.estimation import baselines, descent, gauss_newton, mesh_bias
-from r2s.estimation.gauss_newton import Descent, Normal
+from r2s.estimation import descent, gauss_newton, methods, standard_errors
+from r2s.estimation.descent import Run
 from r2s.estimation.judgement import NO_DERIVATIVE, with_uncertainty
-from r2s.estimation.mesh_bias import MeshError, OtherMesh
 from r2s.estimation.method import Budget
 from r2s.estimation.prediction import derivatives_at, theta_length
-from r2s.estimation.problem import NuisancePrior, Problem
+from r2s.estimation.problem import Problem
+from r2s.estimation.standard_errors import OtherMesh
 from r2s.materials import prior
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
 
-BUDGET = Budget(frame_fractions=(0.25, 0.5), num_starts=2)
+RUN = Run(Budget(frame_fractions=(0.25, 0.5), num_starts=2), jr.key(0), derivatives_at)
 
 
 @pytest.fixture(scope="module")
@@ -29,24 +29,17 @@ def problem():
 
 def row_of(problem, losses):
     """Descents of the first stage with such losses, each in a place of its own."""
-    size, none, stage = theta_length((problem,)), jnp.zeros(()), jnp.zeros((), int)
-    theta, matrix = jnp.zeros(size), jnp.eye(size)
-    normals = [Normal(jnp.array(x), none, none, theta, matrix, matrix) for x in losses]
-    return [Descent(theta + i, normal, none, none, none, stage) for i, normal in enumerate(normals)]
+    size = theta_length((problem,))
+    return [end_at(np.full(size, i), loss, 0, np.eye(size)) for i, loss in enumerate(losses)]
 
 
 def fresh(losses):
     """Instead of new descents: whose losses, once all frames count, are those of their places."""
 
-    def made(problems, budget, thetas, scale, stage, derive):
-        shared = budget.frame_fractions and stage <= len(budget.frame_fractions)
-        found = [1e-6 if shared else losses[int(theta[0])] for theta in thetas]
-        row = [row_of(problems[0], [loss])[0] for loss in found]
-        changes = {"scale": jnp.asarray(scale), "stage": jnp.asarray(stage)}
-        return [
-            dataclasses.replace(each, theta=theta, **changes)
-            for each, theta in zip(row, thetas, strict=True)
-        ]
+    def made(problems, run, thetas, scale, stage):
+        shared = 0 < stage <= len(run.budget.frame_fractions)
+        row = [end_at(t, 1e-6 if shared else losses[int(t[0])], scale=scale) for t in thetas]
+        return [dataclasses.replace(end, stage=jnp.asarray(stage)) for end in row]
 
     return made
 
@@ -57,7 +50,7 @@ def test_the_next_best_descent_goes_on_where_the_best_diverges_later(problem, mo
     stages = []
     while row is not None:
         stages.append(descent._best(row))
-        row = descent._next_stage((problem,), BUDGET, row, derivatives_at)
+        row = descent._next_stage((problem,), RUN, row)
     assert [which for which, _ in stages] == [0, 0, 0, 1]
     assert float(stages[-1][1].normal.loss) == pytest.approx(3e-6)
 
@@ -65,32 +58,21 @@ def test_the_next_best_descent_goes_on_where_the_best_diverges_later(problem, mo
 def test_where_all_diverge_it_is_said_and_why(problem, monkeypatch):
     monkeypatch.setattr(descent, "_fresh", fresh([np.inf, np.inf]))
     monkeypatch.setattr(descent, "explain", lambda *_: "frame 3: speed.")
-    row = descent._next_stage((problem,), BUDGET, row_of(problem, [1e-6, 2e-6]), derivatives_at)
+    row = descent._next_stage((problem,), RUN, row_of(problem, [1e-6, 2e-6]))
     with pytest.raises(
         RuntimeError, match="all descents diverged, the first frame 3: speed. Check"
     ):
         while row is not None:
-            row = descent._next_stage((problem,), BUDGET, row, derivatives_at)
+            row = descent._next_stage((problem,), RUN, row)
     with pytest.raises(RuntimeError, match="all starts of the descents diverged"):
-        descent.multi_start((problem,), Budget(num_samples=0, num_starts=1), key=jr.key(0))
+        descent.multi_start((problem,), RUN.near())
 
 
 def test_cma_es_gives_no_fabric_of_runs_that_all_diverged(problem, monkeypatch):
     pytest.importorskip("cma")
-    monkeypatch.setattr(
-        baselines, "_losses", lambda problems, thetas: jnp.full(len(thetas), jnp.inf)
-    )
+    monkeypatch.setattr(methods, "_losses", lambda problems, thetas: jnp.full(len(thetas), jnp.inf))
     with pytest.raises(RuntimeError, match="all .* simulations of CMA-ES diverged"):
-        baselines.cma_es((problem,), 30, key=jr.key(0))
-
-
-def test_cma_es_refuses_a_shared_doubt_of_two_sizes(problem):
-    pytest.importorskip("cma")
-    problems = tuple(
-        dataclasses.replace(problem, nuisance_prior=NuisancePrior(air=air)) for air in (0.1, 0.2)
-    )
-    with pytest.raises(ValueError, match="air"):
-        baselines.cma_es(problems, 30, key=jr.key(0))
+        methods.cma_es((problem,), 30, key=jr.key(0))
 
 
 def test_a_descent_does_not_go_where_its_derivative_is_not_finite(problem):
@@ -112,8 +94,8 @@ def test_without_a_derivative_an_estimate_is_not_sure_and_knows_what_was_known(p
         return [(seen, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), s)) for seen, s in found]
 
     budget = Budget(num_samples=0, num_starts=1, num_probes=0, max_iterations=3)
-    found = descent.multi_start((problem,), budget, derive=without, key=jr.key(0))
-    estimate = with_uncertainty(found, budget, key=jr.key(1))
+    run = Run(budget, jr.key(0), without)
+    estimate = with_uncertainty(descent.multi_start((problem,), run), run)
     assert not estimate.converged and estimate.unsure == NO_DERIVATIVE
     _, precision = problem.space.prior()
     widths = np.array([each.width for each in problem.space.ranges])
@@ -128,8 +110,9 @@ def test_without_a_derivative_the_error_of_a_mesh_is_added_and_nothing_is_solved
     (end,) = row_of(known, [1e-6])
     lost = dataclasses.replace(end.normal, matrix=jnp.full((size, size), jnp.nan))
     end = dataclasses.replace(end, normal=lost)
-    by = MeshError(np.full(size, 0.1), np.eye(size))
-    other = OtherMesh((known,), 4 / 3)
-    found = mesh_bias.correct((known,), other, end, jnp.asarray(jnp.nan), np.eye(size), by)
-    np.testing.assert_allclose(found.covariance, 2 * np.eye(size), rtol=1e-6)
-    np.testing.assert_array_equal(found.theta, end.theta)
+    error, other = (np.full(size, 0.1), np.eye(size)), OtherMesh((known,), 4 / 3)
+    theta, covariance, _ = standard_errors.with_mesh_error(
+        (known,), other, end, jnp.asarray(jnp.nan), np.eye(size), error
+    )
+    np.testing.assert_allclose(covariance, 2 * np.eye(size), rtol=1e-6)
+    np.testing.assert_array_equal(theta, end.theta)

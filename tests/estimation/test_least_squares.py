@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
@@ -93,39 +92,3 @@ def test_a_step_is_no_longer_than_allowed(problem):
     held = proposed(start, gradient, square, Damping.initial(), *limits, 0.2) - start
     assert np.max(np.abs(held)) == pytest.approx(0.2)
     np.testing.assert_allclose(held / 0.2, free / np.max(np.abs(free)), rtol=1e-9)  # as a whole
-
-
-def test_many_at_once_are_each_alone(problem):
-    matrix, right = problem
-    starts = jnp.asarray(np.random.default_rng(2).normal(size=(3, 4)))
-    together = jax.vmap(lambda start: solved(line(matrix, right), start, high=0.1).value)(starts)
-    alone = [solved(line(matrix, right), start, high=0.1).value for start in starts]
-    np.testing.assert_allclose(together, jnp.stack(alone), atol=1e-9)
-
-
-def test_numbers_may_be_a_tree_and_of_single_precision(problem):
-    matrix, right = (part.astype(jnp.float32) for part in problem)
-    start = {"a": jnp.zeros(1, jnp.float32), "b": jnp.zeros((3,), jnp.float32)}
-
-    def residual(y, _):
-        return matrix @ jnp.concatenate([y["a"], y["b"]]) - right
-
-    found = solved(residual, start, low={"a": 0.3, "b": -jnp.inf}, rtol=1e-5, atol=1e-5)
-    low = np.array([0.3, -np.inf, -np.inf, -np.inf])
-    a, b = (np.asarray(part, np.float64) for part in (matrix, right))
-    expected = optimize.lsq_linear(a, b, (low, np.inf)).x
-    both = jnp.concatenate([found.value["a"], found.value["b"]])
-    assert both.dtype == jnp.float32
-    np.testing.assert_allclose(both, expected, atol=1e-4)
-
-
-def test_what_it_ends_at_changes_with_the_data_as_least_squares_do(problem):
-    """Through the solver, by the implicit function theorem."""
-    matrix, right = problem
-
-    def end(right):
-        solver = BoundedGaussNewton(**TIGHT)
-        found = optimistix.least_squares(lambda y, r: matrix @ y - r, solver, jnp.zeros(4), right)
-        return found.value
-
-    np.testing.assert_allclose(jax.jacobian(end)(right), np.linalg.pinv(matrix), atol=1e-8)

@@ -4,25 +4,35 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.random as jr
 import numpy as np
 import pytest
-from known_ends import FABRIC, PLACE, SMALL, SPACE, problem, short_lift, short_problem, valley
-
-from r2s.estimation import descent
-from r2s.estimation.gauss_newton import MARGIN, Descent, Normal, held_back, only_held, room
-from r2s.estimation.least_squares import bounded_step
-from r2s.estimation.mesh_bias import (
-    MeshError,
-    OtherMesh,
-    _positive,
-    _posterior,
-    coarser_of,
-    correct,
-    factor,
-    mesh_error,
+from known_ends import (
+    FABRIC,
+    PLACE,
+    SMALL,
+    SPACE,
+    end_at,
+    problem,
+    short_lift,
+    short_problem,
+    valley,
 )
+
+from r2s.estimation import descent, standard_errors
+from r2s.estimation.descent import Run
+from r2s.estimation.gauss_newton import MARGIN, held_back, only_held, room
+from r2s.estimation.least_squares import bounded_step
 from r2s.estimation.prediction import derivatives_at, theta_length
 from r2s.estimation.problem import Force, Problem
+from r2s.estimation.standard_errors import (
+    OtherMesh,
+    _posterior,
+    coarser_of,
+    factor,
+    mesh_error,
+    with_mesh_error,
+)
 from r2s.materials.parameters import InformedSpace, IsotropicSpace
 from r2s.scenarios import resolution
 
@@ -32,40 +42,32 @@ AT_BOUND = np.array([0.5, 1 - MARGIN])  # the second at its bound
 
 @pytest.fixture(scope="module")
 def end():
-    """A descent that stands at the true fabric."""
+    """A descent that stands at the true fabric, and its derivatives."""
     problems = (problem(1.0),)
     theta = jnp.zeros(theta_length(problems)).at[:2].set(PLACE)
-    (found,) = descent._fresh(problems, SMALL, [theta], 0.0, 0, derivatives_at)
-    return problems, found
+    run = Run(SMALL, jr.key(0), derivatives_at)
+    (descent_end,) = descent._fresh(problems, run, [theta], 0.0, 0)
+    return problems, descent_end, derivatives_at(problems, theta)
 
 
 @pytest.mark.slow(group="estimates")
-def test_the_same_mesh_has_no_bias(end):
-    problems, found = end
-    seen = derivatives_at(problems, found.theta)
-    by = mesh_error(problems, OtherMesh(problems, 1.0), found, seen)
-    np.testing.assert_allclose(by.bias, 0, atol=1e-9)
-    np.testing.assert_allclose(by.covariance, 0, atol=1e-9)
+def test_the_bias_of_a_mesh_is_the_stiffness_that_its_motion_is_that_of(end):
+    problems, at, seen = end
+    bias, covariance = mesh_error(problems, OtherMesh(problems, 1.0), at, seen)
+    np.testing.assert_allclose(bias, 0, atol=1e-9)
+    np.testing.assert_allclose(covariance, 0, atol=1e-9)
+    bias, covariance = mesh_error(problems, OtherMesh((problem(1.05),), 2.0), at, seen)
+    assert bias[0] * SPACE.ranges[0].width == pytest.approx(2 * np.log(1.05), rel=0.2)
+    assert np.linalg.eigvalsh(covariance - np.outer(bias, bias))[0] > -1e-12
 
 
 @pytest.mark.slow(group="estimates")
-def test_a_mesh_that_moves_like_a_stiffer_fabric_has_the_bias_of_that_stiffness(end):
-    problems, found = end
-    seen = derivatives_at(problems, found.theta)
-    other = OtherMesh((problem(1.05),), 2.0)
-    by = mesh_error(problems, other, found, seen)
-    assert by.bias[0] * SPACE.ranges[0].width == pytest.approx(2 * np.log(1.05), rel=0.2)
-    assert np.linalg.eigvalsh(by.covariance - np.outer(by.bias, by.bias))[0] > -1e-12
-
-
-@pytest.mark.slow(group="estimates")
-def test_a_motion_that_fails_leaves_the_whole_range_in_doubt(end):
-    problems, found = end
-    seen = derivatives_at(problems, found.theta)
+def test_a_motion_that_fails_has_an_error_of_the_whole_range(end):
+    problems, at, seen = end
     broken = eqx.tree_at(lambda p: p.scenario.path, problems[0], replace_fn=lambda p: p * jnp.nan)
-    by = mesh_error(problems, OtherMesh((broken,), 1.0), found, seen)
-    np.testing.assert_allclose(by.bias, 1)
-    np.testing.assert_allclose(by.covariance, np.eye(len(by.bias)))
+    bias, covariance = mesh_error(problems, OtherMesh((broken,), 1.0), at, seen)
+    np.testing.assert_allclose(bias, 1)
+    np.testing.assert_allclose(covariance, np.eye(len(bias)))
 
 
 def test_steps_to_finer_and_coarser_meshes_lead_to_the_same_limit():
@@ -81,46 +83,9 @@ def lifted():
     return short_problem()
 
 
-def test_where_an_estimate_errs_by_more_than_noise_its_posterior_is_that_of_less_information(
-    lifted,
-):
-    """Against the posterior of a normal distribution; the end is that of noise alone."""
-    random = np.random.default_rng(1)
-    dim, size = lifted.space.dim, theta_length((lifted,))
-    root, other = random.normal(size=(2, size, 2 * size))
-    known = np.eye(size)
-    known[:dim, :dim] = (other @ other.T)[:dim, :dim]
-    mean = np.zeros(size)
-    mean[:dim] = 0.4
-    space = InformedSpace.make(
-        lifted.space, jnp.asarray(mean[:dim]), jnp.asarray(known[:dim, :dim])
-    )
-    problems = (dataclasses.replace(lifted, space=space),)
-    told, seen = root @ root.T + 50 * np.eye(size), 0.4 + 0.1 * random.normal(size=size)
-    both = np.linalg.inv(told + known)
-    end, _ = valley(lifted, size)
-    normal = dataclasses.replace(end.normal, matrix=jnp.asarray(0.01 * told))
-    theta = both @ (told @ seen + known @ mean)
-    normal = dataclasses.replace(normal, gradient=jnp.asarray(0.01 * told @ (theta - seen)))
-    end = dataclasses.replace(end, theta=jnp.asarray(theta), normal=normal)
-    prior = jnp.asarray(0.01)
-
-    way, errors = _posterior(problems, end, prior, both)  # noise was all there is
-    np.testing.assert_allclose(way, 0, atol=1e-6)
-    np.testing.assert_allclose(errors, both, rtol=1e-5, atol=1e-9)
-    less = told / 3  # the recordings err by more
-    way, errors = _posterior(problems, end, prior, np.linalg.inv(less + known))
-    expected = np.linalg.inv(less + known)
-    np.testing.assert_allclose(errors, expected, rtol=1e-5, atol=1e-9)
-    there = expected @ (less @ seen + known @ mean)
-    np.testing.assert_allclose(theta + way, there, rtol=1e-5, atol=1e-8)
-    way, _ = _posterior(problems, end, prior, 2 * np.linalg.inv(known))
-    np.testing.assert_allclose(theta + way, mean, rtol=1e-5, atol=1e-8)
-
-
 def staying(lifted, raw, off, bias):
-    """The `correct` variance and bias of an end, whose prior has a variance of 1/16 for each number
-    of a fabric, `off` its mean by so much; `raw` is the variance without the prior."""
+    """The variance and bias of an end whose prior has a variance of 1/16 for each number of a
+    fabric, and its mean `off` by so much; `raw` is the variance without the prior."""
     dim, size = lifted.space.dim, theta_length((lifted,))
     known = np.eye(size)
     known[:dim, :dim] *= 16
@@ -136,9 +101,9 @@ def staying(lifted, raw, off, bias):
     covariance = np.diag(np.r_[raw, np.full(size - 1, 1e-4)])
     theirs = np.r_[bias, np.zeros(size - 1)]
     other, one = OtherMesh((lifted,), factor(0.5)), jnp.ones(())
-    by = MeshError(theirs, np.outer(theirs, theirs))
-    at, flat, _ = correct((lifted,), other, end, one, covariance, by)
-    there, found, left = correct(problems, other, end, one, covariance, by)
+    error = theirs, np.outer(theirs, theirs)
+    at, flat, _ = with_mesh_error((lifted,), other, end, one, covariance, error)
+    there, found, left = with_mesh_error(problems, other, end, one, covariance, error)
     assert at is end.theta and there is end.theta
     assert left[0] <= np.sqrt(found[0, 0])
     np.testing.assert_allclose(flat, covariance + np.diag(theirs**2))
@@ -155,17 +120,6 @@ def test_what_is_known_limits_the_errors_of_an_estimate_that_stays_but_for_the_w
     assert left == pytest.approx(0.255, abs=0.01)
     far, _ = staying(lifted, 0.04, 2.5, 0.0)  # eight standard deviations of the prior
     np.testing.assert_allclose(far, 0.04, rtol=1e-3)
-
-
-def test_a_covariance_that_rounding_left_singular_has_errors_too(lifted):
-    """Two numbers of which single precision tells only a combination."""
-    size = theta_length((lifted,))
-    broken = 1e-4 * np.eye(size)
-    broken[0, 1] = broken[1, 0] = 1e-4 * (1 + 1e-6)
-    assert np.linalg.eigvalsh(broken)[0] < 0
-    mended = _positive(broken)
-    assert np.linalg.eigvalsh(mended)[0] > 0
-    np.testing.assert_allclose(mended, broken, atol=1e-9)
 
 
 def test_what_tests_measured_draws_an_estimate_only_as_far_as_the_finer_mesh_allows(
@@ -189,11 +143,10 @@ def test_what_tests_measured_draws_an_estimate_only_as_far_as_the_finer_mesh_all
             assert scale is end.scale
             return 1.0 if float(end.theta[0] - theta[0]) <= limit else 2.0
 
-        monkeypatch.setattr("r2s.estimation.mesh_bias.predictions_at", lambda _, theta: theta)
-        monkeypatch.setattr("r2s.estimation.mesh_bias.loss_from", loss)
-        other = OtherMesh(problems, factor(ratio))
-        by = MeshError(bias, np.diag(bias**2))
-        theta, errors, _ = correct(problems, other, end, one, covariance, by)
+        monkeypatch.setattr(standard_errors, "predictions_at", lambda _, theta: theta)
+        monkeypatch.setattr(standard_errors, "loss_from", loss)
+        other, error = OtherMesh(problems, factor(ratio)), (bias, np.diag(bias**2))
+        theta, errors, _ = with_mesh_error(problems, other, end, one, covariance, error)
         return float(end.theta[0] - theta[0]), np.sqrt(errors[0, 0])
 
     whole, error = went(1.0)
@@ -204,22 +157,18 @@ def test_what_tests_measured_draws_an_estimate_only_as_far_as_the_finer_mesh_all
     assert went(1e-4)[0] == 0 and went(1.0, ratio=2.0)[0] == 0  # a coarser mesh allows nothing
 
 
-def test_the_coarser_of_two_meshes_is_the_same_from_either_but_for_what_stays(lifted):
+def test_the_coarser_of_two_meshes_is_the_same_from_either_but_for_pulls(lifted):
     coarse, fine = [tuple(dataclasses.replace(lifted) for _ in range(2)) for _ in range(2)]
     to_finer, to_coarser = OtherMesh(fine, factor(0.5)), OtherMesh(coarse, factor(2.0))
-    assert to_finer.is_finer and not to_coarser.is_finer
     for problems, other in ((coarse, to_finer), (fine, to_coarser)):
         found, beside = coarser_of(problems, other)
         for which in (0, 1):
             assert found[which] is coarse[which] and beside[which].problems[0] is fine[which]
             assert beside[which].factor == to_finer.factor
-    pulled = (pull(fine[0]), fine[1])
-    found, beside = coarser_of(pulled, to_coarser)
-    assert found[0] is pulled[0] and found[1] is coarse[1]
+    found, beside = coarser_of((pull(fine[0]), fine[1]), to_coarser)
+    assert found[0].is_pulled and found[1] is coarse[1]
     assert beside[0].problems[0] is coarse[0] and beside[0].factor == to_coarser.factor
     assert beside[1].problems[0] is fine[1] and beside[1].factor == to_finer.factor
-    assert coarser_of(coarse, to_finer)[0] is coarse  # so that places are not derived again
-    assert coarser_of(coarse, None) == (coarse, ())
 
 
 def pull(problem: Problem) -> Problem:
@@ -235,14 +184,6 @@ def problems():
     space = IsotropicSpace.make(float(FABRIC.density))
     known = InformedSpace.make(space, jnp.full(space.dim, 0.5), jnp.eye(space.dim))
     return (Problem.make(short_lift(), known, shape=(4, 4)),)
-
-
-def _end(theta, gradient, matrix) -> Descent:
-    none = jnp.zeros(())
-    normal = Normal(
-        none, none, none, jnp.asarray(gradient), jnp.asarray(matrix), 0 * jnp.asarray(matrix)
-    )
-    return Descent(jnp.asarray(theta), normal, none, none, none, jnp.zeros((), int))
 
 
 @pytest.fixture
@@ -263,7 +204,7 @@ def recorded(problems):
     held = right[free] - whole[np.ix_(free, ~free)] @ theta[~free]
     theta[free] = np.linalg.solve(whole[np.ix_(free, free)], held)
     assert np.all((theta[:DIM] > 0) & (theta[:DIM] < 1))
-    return problems, _end(theta, told @ (theta - peak), told), told, known, peak, mean
+    return problems, end_at(theta, 0.0, told @ (theta - peak), told), told, known
 
 
 def test_a_step_inside_is_that_of_newton_and_one_beyond_a_bound_that_of_the_others():
@@ -287,24 +228,14 @@ def test_a_step_inside_is_that_of_newton_and_one_beyond_a_bound_that_of_the_othe
 
 def test_a_step_without_bounds_would_lead_the_others_away(recorded):
     """What a bound holds is no wish of the others: the end stays where it is."""
-    problems, end, told, known, *_ = recorded
+    problems, end, told, known = recorded
     theta = np.asarray(end.theta)
     way, _ = _posterior(problems, end, jnp.ones(()), np.linalg.inv(told + known))
     np.testing.assert_allclose(way, 0, atol=1e-7)
     back = held_back(problems, end, 1.0)
     assert back[1] > 0.2 and np.abs(np.delete(back, 1)).max() > 0.01
-    inside = _end(np.where(np.arange(len(theta)) == 1, 0.5, theta), end.normal.gradient, told)
+    inside = end_at(np.where(np.arange(len(theta)) == 1, 0.5, theta), 0, end.normal.gradient, told)
     np.testing.assert_allclose(held_back(problems, inside, 1.0), 0, atol=1e-12)
-
-
-def test_recordings_that_err_by_more_leave_a_bound_where_the_prior_says_so(recorded):
-    problems, end, told, known, peak, mean = recorded
-    less = told / 1e4
-    expected = np.linalg.solve(less + known, less @ peak + known @ mean)
-    assert expected[1] < 1 - MARGIN
-    errors = np.linalg.inv(less + known)
-    way, _ = _posterior(problems, end, jnp.ones(()), errors)
-    np.testing.assert_allclose(np.asarray(end.theta) + way, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_room_is_to_the_bounds_and_nuisances_have_no_end(problems):
@@ -314,16 +245,6 @@ def test_room_is_to_the_bounds_and_nuisances_have_no_end(problems):
     np.testing.assert_allclose(down[:DIM], MARGIN - AT_BOUND, atol=1e-9)
     np.testing.assert_allclose(up[:DIM], 1 - MARGIN - AT_BOUND, atol=1e-9)
     assert np.all(np.isinf(down[DIM:])) and np.all(np.isinf(up[DIM:]))
-    held = only_held((down, up))
-    assert held[1][1] == 0 and np.isinf(held[0]).all() and np.isinf(np.delete(held[1], 1)).all()
-
-
-def test_a_bound_is_held_in_single_precision_too(problems):
-    """Where the least place, 1e-3, is a little more than itself, and the largest a little less."""
-    ends = np.array([MARGIN, 1 - MARGIN])
-    theta = np.zeros(theta_length(problems), np.float32)
-    theta[:DIM] = ends
-    assert np.any(theta[:DIM].astype(float) != ends)
-    low, high = only_held(room(problems, jnp.asarray(theta, jnp.float32)))
-    assert low[0] == 0 and high[1] == 0
-    assert np.isinf(high[0]) and np.isinf(low[1])
+    for kind in (float, np.float32):  # in which the largest place is a little less
+        held = only_held(room(problems, jnp.asarray(theta, kind)))
+        assert held[1][1] == 0 and np.isinf(held[0]).all() and np.isinf(np.delete(held[1], 1)).all()

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation.baselines import last_frame
 from r2s.estimation.method import default_space
-from r2s.estimation.methods import METHODS
+from r2s.estimation.methods import METHODS, last_frame
 from r2s.estimation.pinn.pulls import pull_from, pulled
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import POINTS, Problem

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from known_ends import FABRIC, FAMILY, short_problem, valley
+from known_ends import FABRIC, FAMILY, end_at, short_problem, valley
 
 from r2s.estimation import gauss_newton
-from r2s.estimation.gauss_newton import Descent, Normal, normals_at
+from r2s.estimation.gauss_newton import normals_at
 from r2s.estimation.method import Budget
 from r2s.estimation.prediction import Prediction, Sensitivity, theta_length
 from r2s.estimation.problem import Force, Problem
@@ -101,37 +101,6 @@ def test_deviations_are_those_of_a_smooth_loss_or_of_how_far_descents_lie_apart(
         assert np.all(np.isfinite(lost)) and np.all(np.diag(lost) > np.diag(alone))
 
 
-def test_of_the_true_fabric_where_its_end_leads_is_noise(lifted):
-    problems, prior = (lifted,), 1e-9
-    end, at = valley(lifted, theta_length(problems))
-    noise = jnp.arange(1.0, len(end.theta) + 1)
-    noisy = dataclasses.replace(end, normal=at(end.theta, noise))
-
-    def found(end, noise, true):
-        return errors_by(
-            problems, end, prior, [(p, at(p, noise)) for p in (end.theta + 0.01, end.theta)], true
-        )
-
-    np.testing.assert_allclose(found(noisy, noise, True), found(end, 0.0, False), rtol=1e-6)
-    assert np.all(np.diag(found(noisy, noise, False)) > np.diag(found(noisy, noise, True)))
-
-
-def test_steps_lead_apart_alike_on_a_mesh_whose_own_end_leads_elsewhere(lifted):
-    problems, prior = (lifted,), 1e-9
-    end, at = valley(lifted, theta_length(problems))
-    places = sample_around(problems, end, prior, 4, jr.key(0))
-
-    def apart(bias):
-        led = [(p, at(p, 1.0 * i + bias)) for i, p in enumerate(places)]
-        own = jnp.arange(1.0, len(end.theta) + 1) + bias
-        return steps_apart(
-            problems, dataclasses.replace(end, normal=at(end.theta, own)), prior, led
-        )
-
-    assert np.max(np.abs(apart(0.0))) > 1e-2
-    np.testing.assert_allclose(apart(3.0), apart(0.0), rtol=1e-5, atol=1e-9)
-
-
 def test_where_derivatives_overflow_nothing_is_known(lifted):
     problems, prior = (lifted,), 1e-9
     size = theta_length(problems)
@@ -154,7 +123,7 @@ def test_deviations_hang_on_no_limit_and_hardly_on_rounding():
 
     def found(theta, tried_on=None):
         normal = normals_at(problems, [theta], [zero])[0]
-        end = Descent(theta, normal, zero, zero, zero, jnp.zeros((), int))
+        end = dataclasses.replace(end_at(theta), normal=normal)
         return np.sqrt(np.diag(covariance_at(problems, budget, end, jr.key(0), tried_on=tried_on)))
 
     whole = found(theta)
@@ -180,10 +149,7 @@ def fitted(growth, seed=0, space: ParameterSpace = SPACE):
     slope[:, 0, 0] = best * STRETCH * WIDTH
     seen = Prediction(x, jnp.asarray(best * STRETCH[:, None], float), jnp.asarray(True))
     sensitivity = Sensitivity(jnp.zeros((*x.shape, size)), jnp.asarray(slope, float))
-    number, none, square = jnp.zeros(()), jnp.zeros(size), jnp.zeros((size, size))
-    normal = Normal(number, number, number, none, square, square)
-    theta = none.at[: space.dim].set(0.5)
-    end = Descent(theta, normal, number, number, number, jnp.zeros((), int))
+    end = end_at(np.where(np.arange(size) < space.dim, 0.5, 0.0))
     return problem, end, (seen, sensitivity), np.log(SCALE / best) / WIDTH
 
 
@@ -216,15 +182,6 @@ def test_yarns_that_may_stiffen_and_pulls_without_force_have_no_such_error():
     without = Problem(problem.scenario, SPACE, problem.frames)
     assert half_pulled(without) is without
     assert not np.any(model_error((without,), end, jnp.asarray(1e-9), [predicted]))
-
-
-def test_half_of_a_pull_ends_in_the_middle_of_its_force():
-    problem, *_ = fitted(0.0)
-    assert problem.force is not None
-    taut = dataclasses.replace(problem.force, values=problem.force.values + 3)  # from the start
-    half = half_pulled(dataclasses.replace(problem, force=taut))
-    assert half.force is not None
-    np.testing.assert_array_equal(np.asarray(half.force.seen), STRETCH < 0.5)
 
 
 def test_a_change_within_its_noise_is_none():

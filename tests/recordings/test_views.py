@@ -13,9 +13,8 @@ from r2s import scenarios
 from r2s.estimation import normal_equations
 from r2s.estimation.default_spaces import on_mpm
 from r2s.estimation.gauss_newton import normals_at
-from r2s.estimation.methods import problems_on_mpm
 from r2s.estimation.prediction import predict
-from r2s.estimation.problem import NuisancePrior, Problem, check_shared
+from r2s.estimation.problem import NuisancePrior, Problem, check_shared, problems_on_mpm
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.mesh import rectangle

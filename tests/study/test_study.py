@@ -13,11 +13,10 @@ from test_results import LIFTING, NOBODY, row
 
 from r2s.cli.main import main
 from r2s.estimation import default_spaces
-from r2s.estimation.baselines import MASS
-from r2s.estimation.baselines import STRETCH as MULTIPLIER
 from r2s.estimation.estimate import point_estimate
 from r2s.estimation.method import default_space
-from r2s.estimation.methods import METHODS, DiffCloud
+from r2s.estimation.methods import MASS, METHODS, DiffCloud
+from r2s.estimation.methods import STRETCH as MULTIPLIER
 from r2s.materials import presets
 from r2s.materials.arcsim import write_material
 from r2s.study import engine, report, results
