@@ -20,7 +20,7 @@ from scipy.stats import norm
 
 from r2s import scenarios
 from r2s.estimation.consistency import fits
-from r2s.estimation.default_spaces import law_told_by, on_cloth, with_law
+from r2s.estimation.default_spaces import identified_law, on_cloth, with_law
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import loss_from
 from r2s.estimation.mesh_refinement import in_mesh_steps
@@ -204,7 +204,7 @@ def arrived(folder: Path, case: str, seed: str) -> Line:
     """
     recording, truth = recorded(case, folder), CASES[case].fabric
     density = float(truth.density)
-    space = prior.informed(with_law(on_cloth(density), law_told_by([recording])), density)
+    space = prior.informed(with_law(on_cloth(density), identified_law([recording])), density)
     began = time.process_time()
     estimate = DiffCloud().estimate([recording], space, key=jr.key(int(seed)))
     seconds = time.process_time() - began

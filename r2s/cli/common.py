@@ -129,8 +129,8 @@ def choose_shape(
     error = resolution.mesh_error(fabric, size, shape, motion)
     figure = f"{1e3 * error:.1f} mm" if math.isfinite(error) else "not measured"
     words = f"mesh of {shape[0]} x {shape[1]}: expected error {figure}"
-    told = {"shape": list(shape), "mesh_error_m": error}
-    return shape, told, mesh_warning(shape, fabric, size, motion) or [words]
+    content = {"shape": list(shape), "mesh_error_m": error}
+    return shape, content, mesh_warning(shape, fabric, size, motion) or [words]
 
 
 def mesh_warning(

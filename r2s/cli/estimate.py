@@ -196,7 +196,7 @@ class EstimateCard:
 
         Raises `ValueError` for a density in other units, and what the solver's space lacks.
         """
-        from r2s.estimation.default_spaces import law_told_by, with_law
+        from r2s.estimation.default_spaces import identified_law, with_law
         from r2s.estimation.method import default_space
         from r2s.materials.prior import informed
 
@@ -205,7 +205,7 @@ class EstimateCard:
                 f"--density is in kg/m^2, got {self.density:g}: fabrics have {LIGHTEST} to "
                 f"{HEAVIEST:g} (100 g/m^2 are 0.1 kg/m^2)"
             )
-        law = self.law or (law_told_by(recordings) if method.name == "diffcloud" else "linear")
+        law = self.law or (identified_law(recordings) if method.name == "diffcloud" else "linear")
         if method.chosen_solver != "cloth" and (law != "linear" or prior != "flat"):
             raise ValueError("--law and --prior are of the cloth: material points have their own")
         if law != "linear" and method.name == "diffcloud-published":
@@ -272,7 +272,7 @@ def _draw(path: Path, outcome: "Outcome") -> None:
     from r2s.estimation.method import COARSEST
     from r2s.metrics.prediction_error import predict_motion
     from r2s.recordings.open import SimulatedCloth
-    from r2s.scenarios.resolution import alike
+    from r2s.scenarios.resolution import matching_shape
     from r2s.scenarios.scenario import from_recording
     from r2s.viewer.comparison import draw_estimate
 
@@ -281,7 +281,7 @@ def _draw(path: Path, outcome: "Outcome") -> None:
         draw_estimate(path, estimate, outcome.space)
         return
     first = min(recordings, key=lambda each: each.info.scenario == "stretching")
-    shape = alike(estimate.shape or COARSEST, first.info.sheet.size)
+    shape = matching_shape(estimate.shape or COARSEST, first.info.sheet.size)
     scenario = from_recording(first, shape)
     x = predict_motion(scenario, estimate.fabric).x
     sheet = SimulatedCloth(x, np.asarray(scenario.scene.mesh.faces))

@@ -15,7 +15,7 @@ from r2s.laboratory.files import LaboratoryTests
 from r2s.laboratory.pull import Pull
 from r2s.materials.parameters import ParameterSpace
 from r2s.recordings.recording import Recording, clouds_are_markers
-from r2s.scenarios.resolution import alike
+from r2s.scenarios.resolution import matching_shape
 
 POOR = 0.5  # share of outliers, above which a recording is hardly explained at all
 NOTHING = 0.9  # share of outliers, above which nothing is explained
@@ -66,7 +66,7 @@ class Outcome:
         """With what a recording that was held out says of the estimate."""
         tell(progress, f"judging by {recording.info.name}")
         estimate = self.estimate
-        shape = alike(estimate.shape or COARSEST, recording.info.sheet.size)
+        shape = matching_shape(estimate.shape or COARSEST, recording.info.sheet.size)
         air = held_out.air_found(estimate, self.recordings)
         line = held_out.judge(recording, estimate.fabric, shape, air=air).describe()
         by_cloth = "" if self.method.chosen_solver == "cloth" else " (by the cloth)"
@@ -186,7 +186,7 @@ def agreement(
 
 
 def _agree(agreed: Agreement, names: Sequence[str]) -> str:
-    alone = [name for name, told in zip(names, agreed.told, strict=True) if not told]
+    alone = [name for name, directions in zip(names, agreed.told, strict=True) if not directions]
     left = f"; too little information to compare: {', '.join(alone)}" if alone else ""
     if not agreed.is_excused:
         return f"the recordings agree (p = {agreed.p:.2g}){left}"
@@ -249,7 +249,7 @@ def _coarse(estimate: Estimate, recordings: Sequence[Recording]) -> list[str]:
         return []
     fabric, lines = estimate.fabric, []
     for size, scenario in dict.fromkeys((r.info.sheet.size, r.info.scenario) for r in recordings):
-        lines += mesh_warning(alike(estimate.shape, size), fabric, size, scenario)
+        lines += mesh_warning(matching_shape(estimate.shape, size), fabric, size, scenario)
     return lines
 
 

@@ -63,7 +63,7 @@ class Simulate:
             )
         card, experiment = load_card(self.fabric), make_experiment(self.scenario, self.motion)
         fabric, size = card.fabric, experiment.sheet.size
-        shape, told, of_mesh = choose_shape(self.shape, fabric, size, self.scenario)
+        shape, of_shape, of_mesh = choose_shape(self.shape, fabric, size, self.scenario)
         scenario = experiment.scenario(shape, self.self_contact)
         make_solver = {
             "cloth": None,
@@ -101,7 +101,7 @@ class Simulate:
             "solver": self.solver,
             "frames": len(ok),
             "vertices": int(motion.x.shape[1]),
-            **told,
+            **of_shape,
             "interval_s": scenario.interval,
             "diverged_in_frame": int(np.argmin(ok)) if failure else None,
             "failure": failure or None,

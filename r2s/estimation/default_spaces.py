@@ -58,7 +58,7 @@ def with_law(space: ParameterSpace, law: Law) -> ParameterSpace:
     return StiffeningSpace.make(space) if "stiffening" in law else space
 
 
-def law_told_by(recordings: Sequence[Recording]) -> Law:
+def identified_law(recordings: Sequence[Recording]) -> Law:
     """The law that some recordings of one fabric identify: stiffening and softening from another
     motion and a pull with its force, since a pull determines how yarns stiffen and a fold bending.
     Else constant stiffness."""

@@ -97,7 +97,7 @@ def ladder(size: tuple[float, float]) -> list[Shape]:
     return [(cells(n, size[0]) + 1, cells(n, size[1]) + 1) for n in LADDER]
 
 
-def alike(shape: Shape, size: tuple[float, float]) -> Shape:
+def matching_shape(shape: Shape, size: tuple[float, float]) -> Shape:
     """The mesh of the `ladder` of another `size` [m] with as many vertices along its longer side as
     a `shape`; if it has none, the shape itself."""
     return next((mesh for mesh in ladder(size) if max(mesh) == max(shape)), shape)

@@ -13,7 +13,7 @@ import jax
 import jax.random as jr
 
 from r2s._util.files import source_hash, write_json
-from r2s.estimation.default_spaces import Law, law_told_by, with_law
+from r2s.estimation.default_spaces import Law, identified_law, with_law
 from r2s.estimation.estimate import Estimate, as_json, from_json
 from r2s.estimation.method import Budget, Method, default_space
 from r2s.estimation.methods import METHODS
@@ -76,7 +76,7 @@ class EstimateTask(Task):
     - `network`: of "physnet" and "physnet-published".
     - `informed`: as `r2s estimate`, with the prior of fabrics of this weight
       (`r2s.materials.prior`), and on meshes that resolve the fabric; else flat, and on `SHAPES`.
-    - `law`: as in `with_law`; "told": the laws that the recordings identify (`law_told_by`).
+    - `law`: as in `with_law`; "identified": the laws that the recordings identify (`identified_law`).
     """
 
     kind: ClassVar[str] = "estimates"
@@ -91,7 +91,7 @@ class EstimateTask(Task):
     network: TrainedNetwork | None = None
     repeat: int = 0
     informed: bool = False
-    law: Law | Literal["told"] = "linear"
+    law: Law | Literal["identified"] = "linear"
 
     @property
     def scenario(self) -> str:
@@ -123,7 +123,7 @@ class EstimateTask(Task):
 
     def law_from(self, recordings: Sequence[Recording]) -> Law:
         """The law of the fabrics that are searched."""
-        return law_told_by(recordings) if self.law == "told" else self.law
+        return identified_law(recordings) if self.law == "identified" else self.law
 
     def begun(self, folder: Path) -> Path:
         """The state of an unfinished estimate, from which the same source, versions and processor

@@ -316,7 +316,7 @@ def _estimate(
         network,
         repeat,
         informed=as_commands_do,
-        law="told" if as_commands_do else "linear",
+        law="identified" if as_commands_do else "linear",
     )
 
 

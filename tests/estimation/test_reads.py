@@ -41,7 +41,7 @@ def poisoned(recording, frames):
     return dataclasses.replace(recording, points=jnp.asarray(points))
 
 
-def alike(one, other) -> bool:
+def matching_shape(one, other) -> bool:
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
@@ -55,20 +55,20 @@ def test_descents_read_some_points_of_the_frames_that_count(lift, name):
     reads = METHODS[name]().reads(lift)
     assert (reads.points, reads.markers, reads.force) == (POINTS, False, False)
     problem = Problem.make(lift, SPACE, shape=(4, 4))
-    assert alike(
+    assert matching_shape(
         problem, Problem.make(poisoned(lift, others(lift, reads.frames)), SPACE, shape=(4, 4))
     )
     assert problem.clouds is not None and problem.clouds.points.shape[1] == reads.points
     for frame in (reads.frames[0], reads.frames[-1]):
         changed = Problem.make(poisoned(lift, [frame]), SPACE, shape=(4, 4))
-        assert not alike(problem, changed)
+        assert not matching_shape(problem, changed)
 
 
 def test_descents_read_markers_instead_of_clouds_and_the_force_where_it_was_measured(pull):
     reads = METHODS["diffcloud"]().reads(pull)
     assert (reads.points, reads.markers, reads.force) == (0, True, True)
     problem = Problem.make(pull, SPACE, shape=(5, 5))
-    assert alike(problem, Problem.make(poisoned(pull, reads.frames), SPACE, shape=(5, 5)))
+    assert matching_shape(problem, Problem.make(poisoned(pull, reads.frames), SPACE, shape=(5, 5)))
     without = dataclasses.replace(pull, force=None, force_times=None)
     assert not METHODS["diffcloud"]().reads(without).force
     assert Problem.make(without, SPACE, shape=(5, 5)).force is None
@@ -77,7 +77,7 @@ def test_descents_read_markers_instead_of_clouds_and_the_force_where_it_was_meas
 def test_the_network_reads_markers_and_force_and_no_clouds(pull):
     reads = METHODS["pinn"]().reads(pull)
     assert (reads.points, reads.markers, reads.force) == (0, True, True)
-    assert alike(pull_from(pull), pull_from(poisoned(pull, reads.frames)))
+    assert matching_shape(pull_from(pull), pull_from(poisoned(pull, reads.frames)))
     without = dataclasses.replace(pull, force=None, force_times=None)
     with pytest.raises(ValueError, match="no force"):
         pull_from(without)
@@ -86,7 +86,7 @@ def test_the_network_reads_markers_and_force_and_no_clouds(pull):
     published = METHODS["pinn-published"]().reads(pull)
     assert published.markers and not published.force
     given = [pull_from(each, without_force=True) for each in (pull, without)]
-    assert alike(*given)
+    assert matching_shape(*given)
 
 
 def test_images_are_made_of_some_frames(lift):

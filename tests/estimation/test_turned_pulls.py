@@ -14,7 +14,7 @@ import pytest
 
 from r2s import scenarios
 from r2s.cli.estimate import EstimateCard
-from r2s.estimation.default_spaces import law_of, law_told_by, with_law
+from r2s.estimation.default_spaces import identified_law, law_of, with_law
 from r2s.estimation.gauss_newton import least_weight, normal_from, prior_terms
 from r2s.estimation.method import default_space
 from r2s.estimation.methods import METHODS
@@ -144,9 +144,9 @@ def test_a_pull_and_another_motion_determine_how_a_fabric_stiffens_and_softens(b
     info = dataclasses.replace(bias.info, scenario="lifting", angle=0.0)
     motion = dataclasses.replace(bias, info=info)
     without = dataclasses.replace(bias, force=None, force_times=None)
-    assert law_told_by([motion, bias]) == "stiffening+softening"
+    assert identified_law([motion, bias]) == "stiffening+softening"
     for others in ([], [bias], [bias, bias], [motion], [motion, without]):
-        assert law_told_by(others) == "linear"
+        assert identified_law(others) == "linear"
 
     def law(recordings, **options: Any):
         card = EstimateCard((Path("lift.npz"),), 0.2, Path("card.json"), **options)

@@ -11,7 +11,15 @@ from scipy.stats import gmean
 from r2s.materials import presets
 from r2s.materials.fabric import bending_length
 from r2s.scenarios import resolution
-from r2s.scenarios.resolution import ENOUGH, LADDER, TABLE, alike, ladder, mesh_error, shape_for
+from r2s.scenarios.resolution import (
+    ENOUGH,
+    LADDER,
+    TABLE,
+    ladder,
+    matching_shape,
+    mesh_error,
+    shape_for,
+)
 from r2s.scenarios.standard import SIDE
 
 SIZE = (SIDE, SIDE)
@@ -83,5 +91,8 @@ def test_a_taut_sheet_needs_no_finer_mesh_and_has_no_figure():
 def test_another_sheet_has_the_mesh_of_the_same_step():
     strip, square = (0.4, 0.1), (0.45, 0.45)
     assert ladder(strip) == [(9, 3), (17, 5), (33, 9)]  # square cells
-    assert alike((17, 5), square) == (17, 17) and alike((17, 17), strip) == (17, 5)
-    assert alike((12, 12), square) == (12, 12)  # a mesh of no step
+    assert matching_shape((17, 5), square) == (17, 17) and matching_shape((17, 17), strip) == (
+        17,
+        5,
+    )
+    assert matching_shape((12, 12), square) == (12, 12)  # a mesh of no step
