@@ -76,7 +76,7 @@ class EstimateTask(Task):
     - `network`: of "physnet" and "physnet-published".
     - `informed`: as `r2s estimate`, with the prior of fabrics of this weight
       (`r2s.materials.prior`), and on meshes that resolve the fabric; else flat, and on `SHAPES`.
-    - `law`: as in `with_law`; "identified": the laws that the recordings identify (`identified_law`).
+    - `law`: as in `with_law`; "identified": that which the recordings identify (`identified_law`).
     """
 
     kind: ClassVar[str] = "estimates"
