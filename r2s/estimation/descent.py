@@ -307,12 +307,12 @@ def _stop(budget: Budget, stage: int) -> Stop:
     return ON_THE_WAY if budget.is_intermediate else AT_THE_END
 
 
-def has_arrived(search: Search, budget: Budget) -> bool:
-    """Whether the best descent of a search is at its end, see `_arrived`."""
+def has_arrived(search: Search) -> bool:
+    """Whether the best descent of a search is at its end, and was not ended by its budget."""
     which, best = _best(search.rows[-1])
     now, prior = int(best.stage), prior_weight(search.problems, best.normal)
     stage = _rows_of_stage(search.rows, now)
-    return _arrived(search.problems, stage, which, prior, _stop(budget, now))
+    return _arrived(search.problems, stage, which, prior, AT_THE_END)
 
 
 def _arrived(problems: Problems, stage: list[Iteration], start: int, prior, stop: Stop) -> bool:

@@ -137,7 +137,7 @@ def with_uncertainty(
     return dataclasses.replace(
         estimate,
         seconds=seconds,
-        converged=has_arrived(search, run.budget) and not unsure,
+        converged=has_arrived(search) and not unsure,
         agreement=agreed,
         shares=tuple(float(share) for share in recording_weights(problems)) if alone else (),
         misfits=misfits,

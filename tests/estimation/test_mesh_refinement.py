@@ -9,7 +9,7 @@ import pytest
 from known_ends import PLACE, SMALL, SPACE, end_at, lift_of, problem
 
 from r2s.estimation import mesh_refinement
-from r2s.estimation.descent import DEFAULT, Diverged, Run, Search
+from r2s.estimation.descent import DEFAULT, Diverged, Run, Search, has_arrived
 from r2s.estimation.estimate import as_json, from_json, point_estimate
 from r2s.estimation.gauss_newton import normal_from
 from r2s.estimation.mesh_refinement import ALIKE, LIKELY, look_again
@@ -198,6 +198,18 @@ def test_an_end_that_fits_nearly_as_well_is_in_the_errors_though_it_confirms_not
     found, *_ = looked(monkeypatch, *ends)
     assert found.reached == (1, 3)
     assert [float(each[0]) for each in found.others] == pytest.approx([0.297 * LIKELY])
+
+
+@pytest.mark.parametrize(("gain", "expected"), [(0.01, False), (1e-5, True)])
+def test_a_search_whose_last_steps_still_gain_has_not_arrived(gain, expected):
+    """Nor where an earlier stage, of fewer frames, would have been content."""
+    problems = (problem(1.0),)
+    size = theta_length(problems)
+    rows = [
+        [end_at(np.full(size, 0.5 + 0.01 * i), (1 - gain) ** i, gradient=1.0, matrix=np.eye(size))]
+        for i in range(6)
+    ]
+    assert has_arrived(Search(problems, rows, 0.0)) == expected
 
 
 def test_an_estimate_says_how_many_searches_ended_there():
