@@ -86,6 +86,13 @@ def test_an_orthotropic_plate_has_the_stiffness_of_the_direction(angle, stiffnes
     assert density == pytest.approx(stiffness / 2, rel=1e-12)
 
 
+def test_an_isotropic_plate_twists_as_it_bends():
+    """Curvatures of 1 and -1 along two axes are a twist along those at 45 degrees."""
+    law = PlateBending.make(2.0, 0.3)
+    bending, twist = jnp.array([1.0, -1.0, 0.0]), jnp.array([0.0, 0.0, 2.0])
+    assert law.energy_density(twist) == pytest.approx(float(law.energy_density(bending)))
+
+
 def test_a_solid_plate_has_the_textbook_stiffness():
     law = PlateBending.isotropic(2e9, 0.3, 1e-3)
     assert law.stiffness == pytest.approx(2e9 * 1e-9 / (12 * (1 - 0.09)))
