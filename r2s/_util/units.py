@@ -15,14 +15,14 @@ AIR_DENSITY = 1.2  # [kg/m^3], at 20 degrees Celsius and 101 kPa
 Scalar = Float[Array, ""] | float
 
 
-def positive(unit: str, **numbers: float) -> None:
+def positive(unit: str, **numbers: float | int) -> None:
     """Raise a `ValueError` that names a number and its unit unless it is positive and finite."""
     for name, value in numbers.items():
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name} must be positive [{unit}], found {value}")
 
 
-def not_negative(unit: str, **numbers: float) -> None:
+def not_negative(unit: str, **numbers: float | int) -> None:
     """As `positive`, but zero is allowed."""
     for name, value in numbers.items():
         if not (math.isfinite(value) and value >= 0):

@@ -422,7 +422,7 @@ class Braked(eqx.Module):
     solver: SheetSolver
     brake: Float[Array, ""]
     steps: int = eqx.field(static=True)
-    dt: Float[Array, ""]
+    dt: Float[Array, ""] | float
 
     def check(self, fabric: Fabric) -> None:
         """Raises `ValueError` where the steps are too long for a fabric."""

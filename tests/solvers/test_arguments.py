@@ -34,14 +34,14 @@ def solver(request, unchecked):
     [
         ({"x": START[:, :2]}, r"state.x must be \(9, 3\).* got \(9, 2\)"),
         ({"v": START[:4]}, r"state.v must be \(9, 3\).* got \(4, 3\)"),
-        ({"control": r2s.Control(START[:1])}, r"control.pinned must be \(2, 3\).* got \(1, 3\)"),
-        ({"control": r2s.Control(CONTROL.pinned, jnp.zeros(2))}, r"control.wind must be \(3,\) or"),
+        ({"control": (START[:1],)}, r"control.pinned must be \(2, 3\).* got \(1, 3\)"),
+        ({"control": (CONTROL.pinned, jnp.zeros(2))}, r"control.wind must be \(3,\) or"),
     ],
 )
 def test_shapes_that_do_not_fit_are_named(solver, change, words):
     of_state = {name: value for name, value in change.items() if name != "control"}
     state = dataclasses.replace(solver.init(START), **of_state)
-    control = change.get("control", CONTROL)
+    control = r2s.Control(*change["control"]) if "control" in change else CONTROL
     for step in (solver.step, jax.jit(lambda *arguments: solver.step(*arguments))):
         with pytest.raises(ValueError, match=words):
             step(FABRIC, state, control)
