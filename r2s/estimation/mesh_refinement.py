@@ -123,6 +123,7 @@ class _Meshes(NamedTuple):
         """A search from the end of another, and from other starts: of several recordings these
         begin on the coarsest mesh, where they take a quarter of the time."""
         end = self.search(search.shapes, search.theta, leads_on=False)
+        end = end._replace(unsure=search.unsure)
         is_single = len(self.recordings) == 1 or search.shapes == self.coarsest
         return look_again(end, self.run, None if is_single else self.problems(self.coarsest))
 
@@ -154,7 +155,8 @@ def _refined(
             if not is_too_coarse(meshes.recordings, search.fabric, search.shapes):
                 break
         try:
-            search = _continued(search, meshes.search(shapes, search.theta, leads_on=not is_last))
+            on_finer = meshes.search(shapes, search.theta, leads_on=not is_last)
+            search = _continued(search, on_finer, meshes.run)
         except Diverged as error:
             if finest:
                 raise
@@ -164,12 +166,13 @@ def _refined(
     return search, ""
 
 
-def _continued(before: Search, finer: Search) -> Search:
-    """A finer search, with how many searches confirmed the one before. Where it fits worse, it
-    ended in another minimum."""
-    fits = float(finer.best.normal.loss) <= LIKELY * float(before.best.normal.loss)
+def _continued(before: Search, finer: Search, run: Run) -> Search:
+    """A finer search, with what other searches said of the one before. Where it fits worse, by one
+    outlier scale, it ended in another minimum."""
+    old, new = _losses([before, finer], run)
     worse = f"{_words(finer.shapes)} vertices fit worse than {_words(before.shapes)} did"
-    return finer._replace(reached=before.reached, unsure=before.unsure if fits else worse)
+    unsure = before.unsure if new <= LIKELY * old else worse
+    return finer._replace(reached=before.reached, others=before.others, unsure=unsure)
 
 
 def look_again(search: Search, run: Run, coarse: Problems | None = None) -> Search:
@@ -208,11 +211,12 @@ def look_again(search: Search, run: Run, coarse: Problems | None = None) -> Sear
         best = multi_start(problems, to_the_end, start=best.theta, words="its end")
         ends.append(best)
     alone = f"none of {count - 1} searches from other starts fits as well"
+    unsure = search.unsure if search.theta is best.theta else ""  # of an earlier mesh
     return best._replace(
         seconds=sum(end.seconds for end in ends),
         others=others,
         reached=(close, count),
-        unsure="" if close > 1 else alone,
+        unsure=unsure if close > 1 else alone,
         shapes=search.shapes,
     )
 

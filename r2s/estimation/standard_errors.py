@@ -337,7 +337,7 @@ def with_mesh_error(
     if not (isinstance(space, InformedSpace) and is_finite(end.normal)):
         return end.theta, raw, bias
     way, errors = _posterior(problems, end, prior, raw)
-    share = _allowed(other, end, way) if space.measured and other.is_finer else 0.0
+    share = _allowed(problems, other, end, way) if space.measured and other.is_finer else 0.0
     left = (1 - share) * way
     errors = errors + np.outer(left, left)
     if not share:
@@ -346,17 +346,22 @@ def with_mesh_error(
     return _at(other, end, share * way), errors, np.clip(bias, -most, most)
 
 
-def _allowed(other: OtherMesh, end: Descent, way: Vector) -> float:
+def _allowed(problems: Problems, other: OtherMesh, end: Descent, way: Vector) -> float:
     """The share of a way from the end, halved as often as needed, at which the loss of the finer
-    mesh is `RISE` times that at the end at most; 0 after `HALVINGS`."""
+    mesh is `RISE` times that at the end at most and the own mesh does not diverge; 0 after
+    `HALVINGS`, or where the finer mesh diverges at the end."""
 
-    def loss(share: float) -> float:
+    def loss(on: Problems, share: float) -> float:
         theta = _at(other, end, share * way)
-        return loss_from(other.problems, predictions_at(other.problems, theta), end.scale)
+        return loss_from(on, predictions_at(on, theta), end.scale)
 
-    most = RISE * loss(0.0)
-    shares = (0.5**i for i in range(HALVINGS))
-    return next((share for share in shares if loss(share) <= most), 0.0)
+    most = RISE * loss(other.problems, 0.0)
+    if not np.isfinite(most):
+        return 0.0
+    for share in (0.5**i for i in range(HALVINGS)):
+        if loss(other.problems, share) <= most and np.isfinite(loss(problems, share)):
+            return share
+    return 0.0
 
 
 def _at(other: OtherMesh, end: Descent, way: Vector) -> Theta:

@@ -101,6 +101,8 @@ def _search(estimate: Estimate, mesh: str) -> list[str]:
     elif estimate.reached is not None:
         ended, searches = estimate.reached
         words += f"; {ended} of {searches} searches from different starts fit as well"
+    else:
+        words += "; no other start was tried"
     return [f"search{mesh}: {words}, {estimate.seconds:.0f} s"]
 
 

@@ -125,13 +125,20 @@ def test_recordings_count_by_what_is_left_of_them_alone_and_none_is_exact():
 
 
 @pytest.mark.parametrize(("loss", "words"), [(1.2, "as it was"), (1.3, "5 x 5 vertices fit worse")])
-def test_a_finer_mesh_that_fits_worse_is_another_minimum(loss, words):
-    def level(shape, loss):
-        return Search((), [[end_at(np.zeros(3), loss)]], 0.0, (2, 3), "as it was", shapes=(shape,))
+def test_a_finer_mesh_that_fits_worse_is_another_minimum(loss, words, monkeypatch):
+    """By one outlier scale; what other searches said of the coarser mesh is kept."""
+    other = jnp.zeros(3)
 
-    search = mesh_refinement._continued(level((3, 3), 1.0), level((5, 5), loss))
+    def level(shape, place, scale):
+        row, problems = [end_at(np.full(3, place), scale=scale)], (Stub(),)
+        said = (2, 3), "as it was", (other,), (shape,)
+        return Search(problems, [row], 0.0, *said)  # pyright: ignore
+
+    run, scales = by_place(monkeypatch)
+    search = mesh_refinement._continued(level((3, 3), 1.0, 6e-3), level((5, 5), loss, 15e-3), run)
     assert search.reached == (2, 3) and search.unsure.startswith(words)
-    assert search.shapes == ((5, 5),)
+    assert search.shapes == ((5, 5),) and search.others == (other,)
+    assert scales == pytest.approx([6e-3, 6e-3])
 
 
 class Stub:
@@ -146,10 +153,23 @@ def ended(place: float, scale: float = 6e-3) -> Search:
     return Search((Stub(),), [row], 1.0)  # pyright: ignore
 
 
+def by_place(monkeypatch) -> tuple[Run, list[float]]:
+    """A run in which the loss of an end is its place, and the outlier scales that were asked."""
+    scales: list[float] = []
+
+    def loss(_, predicted, scale):
+        scales.append(float(scale))
+        return float(predicted[0][0])
+
+    monkeypatch.setattr(mesh_refinement, "loss_from", loss)
+    run = Run(DEFAULT, jr.key(0), lambda _, theta, __: [(theta, None)])  # pyright: ignore
+    return run, scales
+
+
 def looked(monkeypatch, first: Search, *others: Search | None):
     """The look at a first end, where other searches end at others (None: they diverge); the loss of
     an end is its place."""
-    left, starts, scales = iter(others), [], []
+    left, starts = iter(others), []
 
     def search(problems, run, *, start, words):
         assert run.budget.num_starts == 1 and not run.budget.num_samples
@@ -160,13 +180,8 @@ def looked(monkeypatch, first: Search, *others: Search | None):
             raise Diverged("all starts of the descents diverged")
         return end
 
-    def loss(_, predicted, scale):
-        scales.append(float(scale))
-        return float(predicted[0][0])
-
     monkeypatch.setattr(mesh_refinement, "multi_start", search)
-    monkeypatch.setattr(mesh_refinement, "loss_from", loss)
-    run = Run(DEFAULT, jr.key(0), lambda _, theta, __: [(theta, None)])  # pyright: ignore
+    run, scales = by_place(monkeypatch)
     return look_again(first, run), starts, scales
 
 

@@ -117,7 +117,7 @@ def test_numbers_beside_the_file_are_checked(file, given):
         ({"bending": HingeBending(jnp.asarray(jnp.nan))}, ValueError, "cannot write .*bending"),
     ],
 )
-def test_what_a_file_cannot_hold_is_refused(tmp_path, changes, error, message):
+def test_what_a_file_cannot_hold_is_refused(tmp_path, unchecked, changes, error, message):
     path = tmp_path / "refused.json"
     with pytest.raises(error, match=message):
         write_material(path, dataclasses.replace(CONSTANT, **changes))
