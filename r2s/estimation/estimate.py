@@ -280,8 +280,10 @@ NEEDED = ("approach", "correlation", "nuisances", "loss", "seconds", "converged"
 
 def _plain(value: Any) -> Any:
     """A field as JSON has it: arrays and tuples as lists, named tuples as objects."""
-    if isinstance(value, np.ndarray | np.generic):
-        plain = np.array(value, object)
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, np.ndarray):
+        plain = value.astype(object)
         plain[~np.isfinite(value)] = None
         return plain.tolist()
     if hasattr(value, "_asdict"):

@@ -15,7 +15,17 @@ from hypothesis import given
 
 from r2s.estimation import cards
 from r2s.estimation.cards import Card, Provenance
-from r2s.estimation.estimate import Estimate, Nuisance, point_estimate
+from r2s.estimation.estimate import (
+    Agreement,
+    Contradiction,
+    Estimate,
+    Fit,
+    Misfit,
+    Nuisance,
+    as_json,
+    from_json,
+    point_estimate,
+)
 from r2s.materials import presets
 from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
@@ -136,6 +146,31 @@ def test_an_estimate_comes_back_without_its_history(place, deviations):
     np.testing.assert_array_equal(back.correlation, found.correlation)
     np.testing.assert_array_equal(back.values, found.values)
     assert back.ranges == found.ranges
+
+
+def test_an_estimate_in_single_precision_comes_back():
+    """As estimates are by default: JSON knows no NumPy numbers."""
+    one = np.float32(0.5)
+    wide = estimate_at(np.full(FAMILY.dim, 0.5), np.full(FAMILY.dim, 0.25), loss=0.5)
+    single = dataclasses.replace(
+        wide,
+        values=wide.values.astype(np.float32),
+        standard_errors=wide.standard_errors.astype(np.float32),
+        correlation=wide.correlation.astype(np.float32),
+        mesh_bias=np.full(FAMILY.dim, one),
+        loss=one,
+        losses=wide.losses.astype(np.float32),
+        nuisances=(Nuisance("shift x", "m", one, np.float32(np.nan)),),
+        fits=(Fit("lift", one, one, one, np.float32(np.nan)),),
+        misfits=(Misfit(0, "force", one, ""),),
+        shares=(one, one),
+        agreement=Agreement(one, (1, 2), Contradiction(1, "warp", one, (one, one)), (one, one)),
+    )
+    text = json.dumps(as_json(single), allow_nan=False)
+    read = from_json(json.loads(text))
+    np.testing.assert_array_equal(read.values, single.values)
+    assert read.agreement == single.agreement and read.misfits == single.misfits
+    assert read.fits[0].distance == 0.5 and np.isnan(read.fits[0].mesh)
 
 
 def test_what_is_not_determined_is_on_the_card_with_units():
