@@ -1,5 +1,7 @@
 """Conditions that what is given must meet."""
 
+from typing import Any
+
 import numpy as np
 
 
@@ -7,3 +9,11 @@ def expect(holds: bool | np.bool_, problem: str) -> None:
     """Raise `ValueError` that says the problem, unless the condition holds."""
     if not holds:
         raise ValueError(problem)
+
+
+def check_kinds(call: str, **expected: tuple[Any, type]) -> None:
+    """Raise a `TypeError` that names an argument of a `call` that is of another type."""
+    for name, (argument, kind) in expected.items():
+        if not isinstance(argument, kind):
+            given = type(argument).__name__
+            raise TypeError(f"{call}: {name} must be a {kind.__name__}, got {given}")

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.arrays import is_traced
+from r2s._util.checks import check_kinds
 from r2s._util.units import AIR_DENSITY, GRAVITY
 from r2s.environment.air import Air, Fan, wind_on_vertices
 from r2s.environment.contact import Table
@@ -64,6 +65,7 @@ class Scene(eqx.Module):
         fan: Fan | None = None,
         gravity: Float[Array, ""] | float = GRAVITY,
     ) -> None:
+        check_kinds("Scene(mesh, pinned)", mesh=(mesh, Mesh))
         self.mesh, self.fan = mesh, fan
         self.pinned = jnp.asarray(pinned, int)
         self.table = table if isinstance(table, Table) else Table.make(table)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from r2s._util.checks import check_kinds
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 
@@ -80,11 +81,6 @@ def check_step_arguments(
 
     - `kind`: that of the solver's states.
     """
-    expected = ("fabric", fabric, Fabric), ("state", state, kind), ("control", control, Control)
-    for name, argument, cls in expected:
-        if not isinstance(argument, cls):
-            raise TypeError(
-                f"step(fabric, state, control): {name} must be a {cls.__name__}, got "
-                f"{type(argument).__name__}"
-            )
+    expected = {"fabric": (fabric, Fabric), "state": (state, kind), "control": (control, Control)}
+    check_kinds("step(fabric, state, control)", **expected)
     scene.check(state, control)

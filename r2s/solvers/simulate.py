@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.arrays import is_traced
+from r2s._util.checks import check_kinds
 from r2s._util.threads import planned
 from r2s.environment.scene import Control
+from r2s.materials.fabric import Fabric
 from r2s.solvers.implicit.newton import SAVED
 from r2s.solvers.results import Result, describe, first_failure, no_failure
 
@@ -111,6 +113,10 @@ def simulate(
     run with a traced one fails in its first step (`Result.TIME_STEP`). And for steps that
     `save_every` does not divide, and times beyond the last step.
     """
+    call = "simulate(solver, fabric, state, control)"
+    check_kinds(call, control=(control, Control))
+    if isinstance(solver, Fabric):
+        raise TypeError(f"{call}: solver must be a solver, got Fabric")
     if not is_traced(solver, fabric):
         solver.check(fabric)
     every = 1 if save_every is None else save_every
@@ -168,7 +174,7 @@ def grouped(control: Control, every: int) -> Control:
     if control.pinned.ndim != 3:
         raise ValueError(
             "control.pinned must be (step, pinned, axis), the control of every step; got an array "
-            f"of shape {control.pinned.shape}"
+            f"of shape {control.pinned.shape} (of a single step: pinned[None])"
         )
     steps = control.pinned.shape[0]
     if every < 1 or steps % every:

@@ -47,6 +47,29 @@ def test_shapes_that_do_not_fit_are_named(solver, change, words):
             step(FABRIC, state, control)
 
 
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: r2s.Scene([0], SCENE.mesh), "mesh must be a Mesh, got list"),  # pyright: ignore
+        (lambda: r2s.ImplicitCloth(0.02, SCENE), "scene must be a Scene, got float"),  # pyright: ignore
+        (lambda: r2s.ImplicitCloth(SCENE.mesh, 0.02), "scene must be a Scene, got Mesh"),  # pyright: ignore
+        (lambda: r2s.ExplicitCloth(SCENE, 0.02, SCENE), "fabric must be a Fabric, got Scene"),  # pyright: ignore
+        (lambda: r2s.MPMCloth(FABRIC, 0.02, SCENE), "scene must be a Scene, got Fabric"),  # pyright: ignore
+        (
+            lambda: r2s.simulate(FABRIC, FABRIC, START, CONTROL),  # pyright: ignore
+            "solver must be a solver, got Fabric",
+        ),
+        (
+            lambda: r2s.simulate(r2s.ImplicitCloth(SCENE, 0.02), FABRIC, START, START),  # pyright: ignore
+            "control must be a Control, got Array",
+        ),
+    ],
+)
+def test_an_argument_of_another_type_is_named(call, words, unchecked):
+    with pytest.raises(TypeError, match=words):
+        call()
+
+
 def test_arguments_in_another_order_and_steps_are_named(solver):
     with pytest.raises(ValueError, match="in seconds, at most 10.0, got 20"):
         r2s.ImplicitCloth(SCENE, 20.0)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.arrays import is_traced
+from r2s._util.checks import check_kinds
 from r2s._util.units import Scalar
 from r2s.environment.contact import PRESSURE_STIFFNESS, SLIP_SPEED
 from r2s.environment.scene import Control, Scene
@@ -105,6 +106,9 @@ class ExplicitCloth(eqx.Module):
         grid: Cells | Literal["of the mesh"] | None = "of the mesh",
         self_contact: bool = False,
     ) -> None:
+        check_kinds("ExplicitCloth(scene, dt, fabric)", scene=(scene, Scene))
+        if fabric is not None:
+            check_kinds("ExplicitCloth(scene, dt, fabric)", fabric=(fabric, Fabric))
         if self_contact:
             raise ValueError(REFUSED)
         if is_traced(fabric):

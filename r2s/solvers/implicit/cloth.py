@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.arrays import is_traced
+from r2s._util.checks import check_kinds
 from r2s._util.units import positive
 from r2s.environment import contact
 from r2s.environment.scene import Control, Scene
@@ -98,6 +99,7 @@ class ImplicitCloth(eqx.Module):
         spectral_radius: float | None = None,
         elimination: Elimination | None = None,
     ) -> None:
+        check_kinds("ImplicitCloth(scene, dt)", scene=(scene, Scene))
         if not is_traced(dt):
             positive("s", dt=float(dt))
             if float(dt) > LONGEST:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from r2s._util.checks import check_kinds
 from r2s._util.units import Scalar, positive
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric, check_fabric
@@ -149,6 +150,7 @@ class MPMCloth(eqx.Module):
         transverse: Transverse | None = None,
         cells: Cells | Literal["of the mesh"] | None = "of the mesh",
     ) -> None:
+        check_kinds("MPMCloth(scene, dt, fabric, grid)", scene=(scene, Scene))
         positive("s", dt=dt)
         self.scene, self.dt = scene, float(dt)
         if background is None:
