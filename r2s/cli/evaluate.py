@@ -128,7 +128,7 @@ class Judged(NamedTuple):
         if self.failure:
             return [f"{name}: the simulation {self.failure}"]
         lines = [
-            f"{name}: mean distance {_mm(self.metrics[DISTANCE])}; prior mean "
+            f"{name}: mean distance of all points {_mm(self.metrics[DISTANCE])}; prior mean "
             f"{_mm(self.prior_mean)}; the noise of its points allows {_mm(self.noise)}",
             *(f"    {words}" for words in self.words),
         ]

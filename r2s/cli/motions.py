@@ -240,4 +240,4 @@ def _consequence(part: str, errors: "Mapping[str, float]") -> list[str]:
     ratio = max(1 + worst, TINY)
     if part == "bending":  # a bending length grows as the cube root (Peirce 1930)
         return [f"    so folds are {ratio ** (1 / 3):.2f} times as wide in that direction ({name})"]
-    return [f"    so the same force stretches it {1 / ratio:.2g} times as far ({name})"]
+    return [f"    so the same force stretches it {1 / ratio:.3g} times as far ({name})"]

@@ -1,6 +1,7 @@
 """Commands on recordings: `r2s check`, `r2s show` and `r2s data`."""
 
 from dataclasses import dataclass
+from math import isnan
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -33,9 +34,10 @@ class Check:
         findings = check(open_recording(self.recording))
         suspicious = sum(each.is_suspicious for each in findings)
         content = {"suspicious": suspicious, "findings": [each._asdict() for each in findings]}
-        total = (
-            f"{suspicious} of {len(findings)} suspicious" if suspicious else "nothing suspicious"
-        )
+        hidden, count = sum(isnan(each.figure) for each in findings), len(findings)
+        total = f"{suspicious} of {count} suspicious" if suspicious else "nothing suspicious"
+        if hidden:
+            total += f"; {hidden} of {count} checks were not possible"
         print_result(self.json, content, [*(each.describe() for each in findings), total])
         return int(suspicious > 0)
 

@@ -44,17 +44,20 @@ def describe(estimate: Estimate) -> list[str]:
 
 
 def next_recording(estimate: Estimate) -> list[str]:
-    """What to record next: that of `NEXT` whose parameters are the least narrowed; none without
-    standard errors."""
+    """What to record next: the two of `NEXT` whose parameters have the most variance left, relative
+    to the prior's; none without standard errors."""
     ratios = zip((bound.name for bound in estimate.ranges), estimate.narrowing, strict=True)
     known = {name: float(ratio) for name, ratio in ratios if np.isfinite(ratio)}
     kinds = {kind: [name for name in names if name in known] for kind, names in NEXT.items()}
     kinds = {kind: names for kind, names in kinds.items() if names}
     if not kinds:
         return []
-    kind = max(kinds, key=lambda kind: np.mean([known[name] for name in kinds[kind]]))
-    named = ", ".join(f"{name} ({known[name]:.2g})" for name in kinds[kind])
-    return [f"record next: {kind}, for {named}"]
+    order = sorted(kinds, key=lambda kind: -sum(known[name] ** 2 for name in kinds[kind]))
+    named = (
+        f"{kind}, for {', '.join(f'{name} ({known[name]:.2g})' for name in kinds[kind])}"
+        for kind in order[:2]
+    )
+    return [f"record next: {'; then '.join(named)}"]
 
 
 def _table(estimate: Estimate) -> list[str]:
@@ -77,12 +80,13 @@ def _table(estimate: Estimate) -> list[str]:
 
 
 def _fit(fit: Fit, mesh: str) -> str:
-    words = [f"fit to {fit.recording}: mean distance {_mm(fit.distance)}"]
+    outliers = f"without the {100 * fit.outliers:.1f} % outliers"
+    words = [f"fit to {fit.recording}: mean distance {_mm(fit.distance)} {outliers}"]
     if np.isfinite(fit.noise):
         words.append(f"the noise of its points allows {_mm(fit.noise)}")
     if np.isfinite(fit.mesh):
-        words.append(f"the mesh{mesh.replace(' on ', ' of ')} is expected to add {_mm(fit.mesh)}")
-    return "; ".join([*words, f"{100 * fit.outliers:.1f} % outliers"])
+        words.append(f"a prediction{mesh} is expected to be {_mm(fit.mesh)} off")
+    return "; ".join(words)
 
 
 def _nuisance(nuisance: Nuisance) -> str:

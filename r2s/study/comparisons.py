@@ -179,7 +179,7 @@ def answers(judged: pd.DataFrame) -> dict[str, str]:
 
 def learned(results: pd.DataFrame, metric: str) -> pd.DataFrame:
     """Whether the errors of each configuration (`conclusion`) on each motion (`comparison`) are
-    below those of the prior median on the same solver, in the recordings that have a skill.
+    below those of the prior mean on the same solver, in the recordings that have a skill.
 
     This test, and not the skill against samples, says what a recording adds to the prior.
     """

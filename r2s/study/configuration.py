@@ -7,7 +7,7 @@ PUBLISHED = "-published"  # after an approach: by the recipe of its paper
 AND = "+"  # between scenarios that are estimated from together
 MOTIONS = ("folding", "fling", "shaking")
 # baselines that are configurations as well, and what stands for an approach in their labels
-REFERENCES = {"true": "true fabric on", "middle": "prior median on"}
+REFERENCES = {"true": "true fabric on", "middle": "prior mean on"}
 ON_CLOTH = "on_cloth"  # the baseline of estimates on material points that predict on the cloth
 
 

@@ -266,7 +266,7 @@ def _evaluations(
     plan: Plan,
 ) -> list[EvaluationTask]:
     """Evaluations of estimates of a fabric on their solver and on the cloth. First come, on all of
-    these, the default's samples, the prior median, and the true fabric where it is known.
+    these, the default's samples, the prior mean, and the true fabric where it is known.
 
     `judged`: the recordings of each scenario.
     """

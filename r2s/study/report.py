@@ -253,7 +253,7 @@ def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> Se
         "accuracy of the truth, 0 for the mean of random fabrics of the same weight (the default). "
         "It is not known where the default is not clearly above the floor. A run that diverged has "
         "an infinite error and a skill of minus infinity.",
-        "The true fabric has the truth's stiffness at small strain. The prior median is the best "
+        "The true fabric has the truth's stiffness at small strain. The prior mean is the best "
         "guess from the weight alone: an approach that is not better has learned nothing.",
     ]
     if left_out := sorted(set(every.fabric) - set(shared.fabric)):
@@ -265,7 +265,7 @@ def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> Se
     tables: Tables = {
         "skill": (f"Error up to the horizon, floor and skill: {INTERVAL}", table),
         "learned": (
-            "Error of the prior median over that of each configuration",
+            "Error of the prior mean over that of each configuration",
             comparisons.learned(known, SURFACE),
         ),
         "skill_by_fabric": ("Skill by fabric", _by_fabric(frame.with_floor(every, SURFACE))),

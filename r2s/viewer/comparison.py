@@ -40,7 +40,7 @@ def draw_prediction(path: Path, recording: Recording, sheets: Mapping[str, Simul
 
     - `sheets`: by name, simulated at the recording's times.
 
-    Under each frame stands the mean distance of its points from the sheet. Returns `path`.
+    Under each frame stands the mean distance of all its points from the sheet. Returns `path`.
     """
     height = PANEL * len(sheets) + 1.0
     figure = Figure(figsize=(PANEL * FRAMES, height))
@@ -101,7 +101,7 @@ def _rows_of_frames(
             draw_surroundings(axes, shown)
             draw_frame(axes, shown, int(frame))
             axes.set_title(f"{name}, {float(recording.times[frame]):.2f} s", fontsize=10, y=0.98)
-            distance = f"mean distance {1e3 * away:.1f} mm" if np.isfinite(away) else "diverged"
+            distance = f"all points: mean {1e3 * away:.1f} mm" if np.isfinite(away) else "diverged"
             axes.text2D(0.5, -0.06, distance, ha="center", fontsize=10, transform=axes.transAxes)
     draw_title_and_legend(figure, shown)
 

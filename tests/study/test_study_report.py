@@ -24,7 +24,7 @@ from r2s.study.results import PARAMETERS, as_frame, labelled, with_skill
 
 LIMIT = 15_000_000  # bytes of a report
 LABELS = "DIFFCLOUD cloth lifting", "DiffCP mpm lifting"
-REFERENCES = "true fabric on cloth", "prior median on cloth", "default cloth"
+REFERENCES = "true fabric on cloth", "prior mean on cloth", "default cloth"
 ESTIMATED = pd.DataFrame(
     [
         ("cloth", "denim", "C11", "N/m", 123.0, 104.3, 145.0, 0.1, 110.0),

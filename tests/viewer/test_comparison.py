@@ -25,7 +25,7 @@ def figures(monkeypatch):
 def distances(figure) -> list[float]:
     """What stands under the frames [mm], in order."""
     texts = [text.get_text() for axes in figure.axes for text in axes.texts]
-    return [float(text.split()[2]) for text in texts if text.startswith("mean distance")]
+    return [float(text.split()[3]) for text in texts if text.startswith("all points: mean")]
 
 
 def test_a_sheet_that_is_moved_by_20_mm_is_that_far_from_the_points(figures, tmp_path):
