@@ -25,9 +25,21 @@ def described(name: str) -> str:
         fields = list(getattr(value, "_fields", getattr(value, "__members__", ())))
         if dataclasses.is_dataclass(value):
             fields = [field.name for field in dataclasses.fields(value)]
-        methods = sorted(n for n in vars(value) if n[0] != "_" and n not in fields)
-        return f"{name}({', '.join(fields)}): {', '.join(methods)}"
+        methods = (each for each in sorted(vars(value)) if each[0] != "_" and each not in fields)
+        members = ", ".join(f"{each}{parameters(value, each)}" for each in methods)
+        made = fields if hasattr(value, "__members__") else inspect.signature(value).parameters
+        return f"{name}({', '.join(made)}) [{', '.join(fields)}]: {members}"
     return f"{name}({', '.join(inspect.signature(value).parameters)})"
+
+
+def parameters(cls: type, name: str) -> str:
+    """Those of a method in brackets, without the first; of a property nothing."""
+    method = inspect.getattr_static(cls, name)
+    if isinstance(method, property) or not callable(getattr(cls, name)):
+        return ""
+    names = list(inspect.signature(getattr(cls, name)).parameters)
+    bound = isinstance(method, classmethod | staticmethod)
+    return f"({', '.join(names if bound else names[1:])})"
 
 
 def listed() -> str:
