@@ -29,7 +29,13 @@ class Control(eqx.Module):
     wind: Float[Array, "*step_and_vertex 3"] | None = None
 
     def at(self, step: Int[Array, ""] | int) -> "Control":
-        """That of one step of a motion; a wind of 3 numbers stays."""
+        """That of one step of a motion; a wind of 3 numbers stays.
+
+        Raises `IndexError` for a number of a step that the motion does not have.
+        """
+        steps = len(self.pinned)
+        if isinstance(step, int) and not -steps <= step < steps:
+            raise IndexError(f"step {step} of a control that has {steps}")
         wind = self.wind
         if wind is not None and wind.ndim > 1:
             wind = wind[step]
@@ -46,7 +52,8 @@ class Scene(eqx.Module):
     - `fan`: where the wind blows; None: everywhere.
     - `gravity`: downwards (along -z), [m/s^2].
 
-    Raises `ValueError` for vertices that the mesh does not have, or that stand twice.
+    Raises `ValueError` for vertices that the mesh does not have, that stand twice or are no whole
+    numbers, and for a gravity that is negative.
     """
 
     mesh: Mesh
@@ -67,6 +74,11 @@ class Scene(eqx.Module):
     ) -> None:
         check_kinds("Scene(mesh, pinned)", mesh=(mesh, Mesh))
         self.mesh, self.fan = mesh, fan
+        numbers: Any = pinned if is_traced(pinned) else np.asarray(pinned)
+        if numbers.size and not jnp.issubdtype(numbers.dtype, jnp.integer):
+            raise ValueError(f"pinned must be whole numbers, of vertices; got {numbers.dtype}")
+        if not is_traced(gravity) and not (np.ndim(gravity) == 0 and np.all(gravity >= 0)):
+            raise ValueError(f"gravity acts downwards, one number [m/s^2] from 0 on; got {gravity}")
         self.pinned = jnp.asarray(pinned, int)
         self.table = table if isinstance(table, Table) else Table.make(table)
         self.air = air if isinstance(air, Air) else Air.make(0.0 if air is None else air)
@@ -84,12 +96,7 @@ class Scene(eqx.Module):
         Shapes are known where values are traced, too.
         """
         vertices, grippers = self.mesh.rest.shape[0], len(self.pinned)
-        for name, array in (("state.x", state.x), ("state.v", state.v)):
-            if array.shape != (vertices, 3):
-                raise ValueError(
-                    f"{name} must be ({vertices}, 3), a place or velocity of each vertex of the "
-                    f"mesh; got {array.shape}"
-                )
+        self.check_vertices(**{"state.x": state.x, "state.v": state.v})
         if control.pinned.shape != (grippers, 3):
             raise ValueError(
                 f"control.pinned must be ({grippers}, 3) in a step, a place of each pinned "
@@ -100,6 +107,16 @@ class Scene(eqx.Module):
                 f"control.wind must be (3,) or ({vertices}, 3) in a step [m/s]; got "
                 f"{control.wind.shape}"
             )
+
+    def check_vertices(self, **arrays: Array | None) -> None:
+        """Raise `ValueError` for an array that has not three numbers for each vertex."""
+        expected = (self.mesh.rest.shape[0], 3)
+        for name, array in arrays.items():
+            if array is not None and array.shape != expected:
+                raise ValueError(
+                    f"{name} must be {expected}, a place or velocity of each vertex of the mesh; "
+                    f"got {array.shape}"
+                )
 
     def place(
         self, x: Float[Array, "vertex 3"], pinned: Float[Array, "pinned 3"]
@@ -135,7 +152,16 @@ def along_path(
     knot_times: Float[Array, " knot"],
     path: Float[Array, "knot gripper 3"],
 ) -> Float[Array, "step gripper 3"]:
-    """Gripper positions [m] at times [s], linear between the knots, at rest before and after."""
+    """Gripper positions [m] at times [s], linear between the knots, at rest before and after.
+
+    Raises `ValueError` for a path of another shape, and for knots whose times do not rise.
+    """
+    if path.ndim != 3 or path.shape[0] != knot_times.shape[0]:
+        raise ValueError(
+            f"path must be (knot, gripper, 3) with {knot_times.shape[0]} knots, got {path.shape}"
+        )
+    if not is_traced(knot_times) and np.any(np.diff(np.asarray(knot_times)) < 0):
+        raise ValueError("knot_times must rise")
     knots = path.reshape(path.shape[0], -1)
     interpolated = jax.vmap(jnp.interp, in_axes=(None, None, 1), out_axes=1)
     return interpolated(times, knot_times, knots).reshape(times.shape[0], *path.shape[1:])

@@ -85,7 +85,13 @@ class ParameterSpace(eqx.Module):
         return len(self.ranges)
 
     def values(self, u: Float[Array, " dim"]) -> Float[Array, " dim"]:
-        """The parameters, in the order and the units of `ranges`, at a point of the unit cube."""
+        """The parameters, in the order and the units of `ranges`, at a point of the unit cube.
+
+        Raises `ValueError` for a point of another dimension.
+        """
+        if u.shape != (self.dim,):
+            names = ", ".join(bound.name for bound in self.ranges)
+            raise ValueError(f"expected {self.dim} numbers from 0 to 1 ({names}), got {u.shape}")
         return jnp.stack([bound.from_unit(u[i]) for i, bound in enumerate(self.ranges)])
 
     def places(self, *values: Float[Array, ""]) -> Float[Array, " dim"]:

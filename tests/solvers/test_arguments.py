@@ -5,6 +5,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import r2s
@@ -68,6 +69,43 @@ def test_shapes_that_do_not_fit_are_named(solver, change, words):
 def test_an_argument_of_another_type_is_named(call, words, unchecked):
     with pytest.raises(TypeError, match=words):
         call()
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (
+            lambda: r2s.Scene(SCENE.mesh, np.array([0.5])),
+            ValueError,
+            "pinned must be whole numbers",
+        ),
+        (lambda: r2s.Scene(SCENE.mesh, gravity=-9.81), ValueError, "gravity acts downwards"),
+        (lambda: CONTROL.at(9), IndexError, "step 9 of a control that has 2"),
+        (
+            lambda: r2s.along_path(jnp.zeros(1), jnp.array([1.0, 0.0]), jnp.zeros((2, 1, 3))),
+            ValueError,
+            "knot_times must rise",
+        ),
+        (
+            lambda: r2s.along_path(jnp.zeros(1), jnp.zeros(2), jnp.zeros((2, 3))),
+            ValueError,
+            r"path must be \(knot, gripper, 3\) with 2 knots",
+        ),
+        (
+            lambda: r2s.OrthotropicSpace.make(0.2)(jnp.zeros(3)),
+            ValueError,
+            r"expected 7 numbers from 0 to 1 \(warp, .*got \(3,\)",
+        ),
+    ],
+)
+def test_a_value_that_makes_no_sense_is_named(call, error, words, unchecked):
+    with pytest.raises(error, match=words):
+        call()
+
+
+def test_a_start_of_other_vertices_is_named(solver):
+    with pytest.raises(ValueError, match=r"x must be \(9, 3\).* got \(4, 3\)"):
+        solver.init(START[:4])
 
 
 def test_arguments_in_another_order_and_steps_are_named(solver):
