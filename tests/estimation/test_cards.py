@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+from typing import Any
 
 import equinox as eqx
 import hypothesis.strategies as st
@@ -150,7 +151,7 @@ def test_an_estimate_comes_back_without_its_history(place, deviations):
 
 def test_an_estimate_in_single_precision_comes_back():
     """As estimates are by default: JSON knows no NumPy numbers."""
-    one = np.float32(0.5)
+    one: Any = np.float32(0.5)
     wide = estimate_at(np.full(FAMILY.dim, 0.5), np.full(FAMILY.dim, 0.25), loss=0.5)
     single = dataclasses.replace(
         wide,
@@ -160,8 +161,8 @@ def test_an_estimate_in_single_precision_comes_back():
         mesh_bias=np.full(FAMILY.dim, one),
         loss=one,
         losses=wide.losses.astype(np.float32),
-        nuisances=(Nuisance("shift x", "m", one, np.float32(np.nan)),),
-        fits=(Fit("lift", one, one, one, np.float32(np.nan)),),
+        nuisances=(Nuisance("shift x", "m", one, one * np.nan),),
+        fits=(Fit("lift", one, one, one, one * np.nan),),
         misfits=(Misfit(0, "force", one, ""),),
         shares=(one, one),
         agreement=Agreement(one, (1, 2), Contradiction(1, "warp", one, (one, one)), (one, one)),
