@@ -269,11 +269,10 @@ def _draw(path: Path, outcome: "Outcome") -> None:
     """Draw an outcome, with the motion of its first recording that is no stretching."""
     import numpy as np
 
+    from r2s.estimation import held_out
     from r2s.estimation.method import COARSEST
-    from r2s.metrics.prediction_error import predict_motion
     from r2s.recordings.open import SimulatedCloth
     from r2s.scenarios.resolution import matching_shape
-    from r2s.scenarios.scenario import from_recording
     from r2s.viewer.comparison import draw_estimate
 
     estimate, recordings = outcome.estimate, outcome.recordings
@@ -282,7 +281,7 @@ def _draw(path: Path, outcome: "Outcome") -> None:
         return
     first = min(recordings, key=lambda each: each.info.scenario == "stretching")
     shape = matching_shape(estimate.shape or COARSEST, first.info.sheet.size)
-    scenario = from_recording(first, shape)
-    x = predict_motion(scenario, estimate.fabric).x
+    air = held_out.air_found(estimate, recordings)
+    scenario, x = held_out.motion(first, estimate.fabric, shape, air)
     sheet = SimulatedCloth(x, np.asarray(scenario.scene.mesh.faces))
     draw_estimate(path, estimate, outcome.space, first, sheet)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax.random as jr
 import numpy as np
+from jaxtyping import Float
 
 from r2s.compilation import clear_in_time
 from r2s.estimation.estimate import Estimate
@@ -17,7 +18,7 @@ from r2s.materials import prior
 from r2s.materials.fabric import Fabric
 from r2s.metrics import prediction_error
 from r2s.recordings.recording import Recording, clouds_are_markers
-from r2s.scenarios.scenario import from_recording, in_denser_air
+from r2s.scenarios.scenario import Scenario, from_recording, in_denser_air
 
 FEWEST = 3  # recordings, of which one is held out without being asked for
 NONE = "none"  # the name by which no recording is held out
@@ -165,10 +166,18 @@ def air_found(estimate: Estimate, recordings: Sequence[Recording]) -> float:
     return next((n.value for n in estimate.nuisances if n.name == AIR), 1.0)
 
 
-def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int], air: float) -> float:
+def motion(
+    recording: Recording, fabric: Fabric, shape: tuple[int, int], air: float = 1.0
+) -> tuple[Scenario, Float[np.ndarray, "frame vertex 3"]]:
+    """The scenario of a recording on a mesh of `shape` vertices in the steps of an estimate, with
+    `air` times the density of the air [-]; and a fabric's positions in it, [m]."""
     scenario = in_denser_air(from_recording(recording, shape), air)
     scenario = in_mesh_steps(scenario, recording.info.scenario, shape)
-    x = prediction_error.predict_motion(scenario, fabric).x
+    return scenario, prediction_error.predict_motion(scenario, fabric).x
+
+
+def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int], air: float) -> float:
+    _, x = motion(recording, fabric, shape, air)
     away = prediction_error.from_surface(recording, x, shape)
     return float(np.mean(away)) if np.isfinite(away).all() else float("inf")
 

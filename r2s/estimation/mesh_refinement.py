@@ -206,12 +206,12 @@ def look_again(search: Search, run: Run, coarse: Problems | None = None) -> Sear
     best = ends[int(np.argmin(losses))]
     likely = [end for end, loss in zip(ends, losses, strict=True) if loss <= LIKELY * min(losses)]
     others = tuple(end.theta for end in likely if end is not best)
+    unsure = search.unsure if best is search else ""  # of an earlier mesh
     if best is not search:
         to_the_end = run.near(is_intermediate=False)
         best = multi_start(problems, to_the_end, start=best.theta, words="its end")
         ends.append(best)
     alone = f"none of {count - 1} searches from other starts fits as well"
-    unsure = search.unsure if search.theta is best.theta else ""  # of an earlier mesh
     return best._replace(
         seconds=sum(end.seconds for end in ends),
         others=others,

@@ -89,9 +89,10 @@ class ParameterSpace(eqx.Module):
 
         Raises `ValueError` for a point of another dimension.
         """
-        if u.shape != (self.dim,):
+        if jnp.shape(u) != (self.dim,):
             names = ", ".join(bound.name for bound in self.ranges)
-            raise ValueError(f"expected {self.dim} numbers from 0 to 1 ({names}), got {u.shape}")
+            shape = jnp.shape(u)
+            raise ValueError(f"expected {self.dim} numbers from 0 to 1 ({names}), got {shape}")
         return jnp.stack([bound.from_unit(u[i]) for i, bound in enumerate(self.ranges)])
 
     def places(self, *values: Float[Array, ""]) -> Float[Array, " dim"]:

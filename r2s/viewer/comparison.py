@@ -14,7 +14,7 @@ import numpy as np
 
 from r2s._util.files import write_bytes
 from r2s.estimation.estimate import Estimate
-from r2s.materials.parameters import ParameterSpace, Range
+from r2s.materials.parameters import InformedSpace, ParameterSpace, Range
 from r2s.metrics.losses import to_surface
 from r2s.recordings.open import SimulatedCloth
 from r2s.recordings.recording import Recording, cloud
@@ -71,7 +71,7 @@ def draw_estimate(
     )
     mean, precision = space.prior()
     prior_deviation = np.sqrt(np.diag(np.linalg.inv(np.asarray(precision))))
-    informed = not np.allclose(np.asarray(mean), 0.5)
+    informed = isinstance(space, InformedSpace)
     for i, bound in enumerate(estimate.ranges):
         axes = figure.add_subplot(grid[i // COLUMNS, i % COLUMNS])
         prior = (float(mean[i]), float(prior_deviation[i])) if informed else None

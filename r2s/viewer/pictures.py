@@ -243,6 +243,7 @@ def _outline(sheet: SheetPlacement) -> np.ndarray:
 
 
 def draw_title_and_legend(figure: Any, content: Content) -> None:
+    """The recording's name at the top of a figure, and at its bottom what each colour is."""
     info = content.recording.info
     title = f"{info.name}: {info.scenario}, {info.fabric}, trial {info.trial}"
     figure.suptitle(title, fontsize=11)
