@@ -62,6 +62,7 @@ class Stop(NamedTuple):
 # too early: the outliers of then may hold it there); or, where more frames follow, roughly.
 AT_THE_END, ON_THE_WAY = Stop(5e-3, 4, 5e-4, 10.0), Stop(0.03, 2, 3e-3, 10.0)
 MORE_FRAMES = Stop(0.03, 2, 0.02, 1.0)
+ONE_ERROR = 0.5  # predicted gain over the prior's weight, of a step of one standard error
 Iteration = list[Descent]  # one iteration: the descents of all starts
 DEFAULT = Budget(frame_fractions=(0.25, 0.5))
 
@@ -313,6 +314,14 @@ def has_arrived(search: Search) -> bool:
     now, prior = int(best.stage), prior_weight(search.problems, best.normal)
     stage = _rows_of_stage(search.rows, now)
     return _arrived(search.problems, stage, which, prior, AT_THE_END)
+
+
+def is_stuck(search: Search) -> bool:
+    """Whether no step lowers the loss at the end of a search, though its derivative says that the
+    minimum is more than a standard error away."""
+    best, prior = search.best, prior_weight(search.problems, search.best.normal)
+    is_far = float(remaining(search.problems, best, prior)) > ONE_ERROR * float(prior)
+    return float(best.damping) >= AT_THE_END.stuck and is_far
 
 
 def _arrived(problems: Problems, stage: list[Iteration], start: int, prior, stop: Stop) -> bool:

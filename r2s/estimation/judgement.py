@@ -23,6 +23,7 @@ from r2s.estimation.descent import (
     Search,
     each_alone,
     has_arrived,
+    is_stuck,
     multi_start,
     stacked,
 )
@@ -56,6 +57,7 @@ from r2s.scenarios import synthetic
 
 NOISE = 3e-3  # [m], of a sensitivity: beyond which a distance is an outlier
 NO_DERIVATIVE = "the derivative is not finite at the end of the search"
+STUCK = "no step lowers the loss as its derivative says: the loss is rough there"
 
 
 def descend(
@@ -116,7 +118,10 @@ def with_uncertainty(
             best = dataclasses.replace(best, theta=theta)
             predictions = predictions_at(problems, theta)
     seconds = search.seconds + time.perf_counter() - began
-    unsure = search.unsure if is_finite(search.best.normal) else NO_DERIVATIVE
+    if not is_finite(search.best.normal):
+        unsure = NO_DERIVATIVE
+    else:
+        unsure = search.unsure or (STUCK if is_stuck(search) else "")
     loss = loss_from(problems, predictions)
     estimate = _collected(problems, best, search.rows, covariance, approach, loss, bias)
     try:

@@ -9,7 +9,7 @@ import pytest
 from known_ends import PLACE, SMALL, SPACE, end_at, lift_of, problem
 
 from r2s.estimation import mesh_refinement
-from r2s.estimation.descent import DEFAULT, Diverged, Run, Search, has_arrived
+from r2s.estimation.descent import DEFAULT, Diverged, Run, Search, has_arrived, is_stuck
 from r2s.estimation.estimate import as_json, from_json, point_estimate
 from r2s.estimation.gauss_newton import normal_from
 from r2s.estimation.mesh_refinement import ALIKE, LIKELY, look_again
@@ -225,6 +225,18 @@ def test_a_search_whose_last_steps_still_gain_has_not_arrived(gain, expected):
         for i in range(6)
     ]
     assert has_arrived(Search(problems, rows, 0.0)) == expected
+
+
+@pytest.mark.parametrize(("slope", "damping", "expected"), [(0, 40, 0), (1, 40, 1), (1, 0.1, 0)])
+def test_a_descent_is_stuck_where_no_step_lowers_the_loss_and_the_end_is_far(
+    slope, damping, expected
+):
+    problems = (problem(1.0),)
+    size = theta_length(problems)
+    matrix = 1e-2 * np.eye(size)
+    end = end_at(np.full(size, 0.5), 1e-6, gradient=1e-3 * slope, matrix=matrix)
+    end = dataclasses.replace(end, damping=jnp.asarray(float(damping)))
+    assert is_stuck(Search(problems, [[end]], 0.0)) == expected
 
 
 def test_an_estimate_says_how_many_searches_ended_there():
