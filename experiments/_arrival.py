@@ -226,7 +226,7 @@ def arrived(folder: Path, case: str, seed: str) -> Line:
         line
         | in_errors(space, truth, estimate)
         | {
-            "left out": f"{100 * max((fit.outliers for fit in estimate.fits), default=0.0):.1f} %",
+            "outliers": f"{100 * max((fit.outliers for fit in estimate.fits), default=0.0):.1f} %",
             "converged": "yes" if estimate.converged else "no",
             "CPU s": f"{seconds:.0f}",
         }

@@ -19,7 +19,7 @@ RESULTS = ROOT / "docs" / "results"
 MARK = re.compile(r"<!-- (?!end of )(\w+) -->")
 STUDY = "make study PRESET=three_fabrics"
 SKILL = (
-    "Error up to the horizon, floor, and skill (1 at the floor, 0 of the default): mean "
+    "Error up to the horizon, floor, and skill (1 at the floor, 0 of samples of the prior): mean "
     "[90 % interval over fabrics]."
 )
 COLUMNS = ["configuration"]
@@ -58,7 +58,7 @@ HEADLINE = (
 )
 ROWS = {
     "estimate": "fling: estimate",
-    "weight alone": "fling: middle",
+    "weight alone": "fling: prior mean",
     "true fabric": "fling: true fabric",
     "floor": "fling: floor",
 }

@@ -30,8 +30,8 @@ NARROWED = 0.5  # of the prior standard deviation: what is below counts as deter
 ESTIMATES = ("", ON_CLOTH)
 NAMED = {name: "estimate" for name in ESTIMATES} | {
     "true": "true fabric",
-    "middle": "middle",
-    "default": "default",
+    "middle": "prior mean",
+    "default": "prior samples",
 }
 
 
@@ -40,10 +40,10 @@ def predicted(folder: Path, configuration: str, fabric: str, law: str) -> Line:
     fabric over the truth's at small strain, how many of these the intervals hold, by how many
     standard errors what is narrowed to half of the prior is off, and the seconds of a CPU.
 
-    `law`: "told" by the recordings, as in a study, or one of `r2s.estimation.default_spaces`.
+    `law`: "identified" by the recordings, as in a study, or one of `r2s.estimation.default_spaces`.
     """
     tasks, estimate = _tasks(configuration, fabric)
-    if law != "told":
+    if law != "identified":
         estimate = replace(estimate, law=law)
         tasks = [
             task if task.estimate is None else replace(task, estimate=estimate) for task in tasks
@@ -116,7 +116,7 @@ def _of(motion: str, rows: pd.DataFrame) -> Line:
         if len(values):  # another simulator's sheet has no true fabric
             line[f"{motion}: {name}"] = _millimetres(values.mean(skipna=False))
     (skill,) = set(rows[rows.baseline.isin(ESTIMATES)].skill)
-    return line | {f"{motion}: skill": "not told" if np.isnan(skill) else f"{skill:.2f}"}
+    return line | {f"{motion}: skill": "unknown" if np.isnan(skill) else f"{skill:.2f}"}
 
 
 def repeated(folder: Path, configuration: str, fabric: str, repeat: str) -> Line:
@@ -167,7 +167,7 @@ def _over_truth(task: EstimateTask, folder: Path) -> Line:
         line[f"growth of {name} (truth)"] = f"{own} ({true})"
     return line | {
         "converged": "yes" if estimate.converged else "no",
-        "left out": ", ".join(f"{fit.outliers:.0%}" for fit in estimate.fits),
+        "outliers": ", ".join(f"{fit.outliers:.0%}" for fit in estimate.fits),
         "recordings agree": _agreement(estimate, task),
         "in 90 % intervals": f"{np.sum(away < norm.ppf(0.95))} of {len(away)}",
         "narrowed": f"{len(known)}",

@@ -4,9 +4,9 @@ python experiments/another_simulator.py --out docs/results/skill_in_mujoco.csv  
 
 The laws, contact, air and steps of MuJoCo's sheet are not those of r2s (`r2s.study.mujoco`).
 From lifts of it, its fold, fling and shaking are predicted. Errors are mean distances up to the
-horizon, beside the floor of an ensemble of MuJoCo's own, the middle of the prior, the mean of
-samples of it (the default), and MuJoCo's material in the laws of r2s (the "true fabric"); skill is
-1 at the floor and 0 at the default. Needs r2s[mujoco].
+horizon, beside the floor of an ensemble of MuJoCo's own, the prior mean, the mean of
+samples of the prior, and MuJoCo's material in the laws of r2s (the "true fabric"); skill is
+1 at the floor and 0 at the samples. Needs r2s[mujoco].
 """
 
 from functools import partial

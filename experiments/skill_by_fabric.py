@@ -4,8 +4,8 @@ python experiments/skill_by_fabric.py --out docs/results/skill_by_fabric.csv    
 python experiments/skill_by_fabric.py --published --out docs/results/published_recipes.csv
 
 By default from a lift and three pulls together. Errors are mean distances up to the horizon, beside
-the floor of the truth, the true fabric at small strain, the middle of the prior and the mean of
-samples of it (the default); skill is 1 at the floor and 0 at the default. Truths stiffen as they
+the floor of the truth, the true fabric at small strain, the prior mean and the mean of
+samples of the prior; skill is 1 at the floor and 0 at the samples. Truths stiffen as they
 stretch and lose up to 35 % of their bending stiffness, which estimates of constant stiffness
 (`--law linear`) cannot follow; by default an estimate has the laws that its recordings determine.
 
@@ -26,8 +26,8 @@ TOGETHER = "diffcloud-cloth-lifting+stretching"
 CAPTION = (
     "Mean distances [mm] up to the horizon, skill, and numbers of the estimate over the truth's "
     "at small strain (coupling: difference; *: the truth is outside its 90 % interval). Growth: by "
-    "how much the energy of a 5 % stretch exceeds that of constant stiffness. Left out: points or "
-    "markers of each recording that count as outliers."
+    "how much the energy of a 5 % stretch exceeds that of constant stiffness. Outliers: points or "
+    "markers of each recording."
 )
 PUBLISHED = (
     "diffcloud-published-cloth-lifting",
@@ -43,7 +43,9 @@ if __name__ == "__main__":
     parser.add_argument("--fabrics", nargs="+", choices=presets.FIVE)
     parser.add_argument("--configurations", nargs="+", default=[TOGETHER])
     parser.add_argument("--published", action="store_true", help="the papers' recipes instead")
-    parser.add_argument("--law", default="told", help="told by the recordings, or linear, ...")
+    parser.add_argument(
+        "--law", default="identified", help="identified by the recordings, or linear, ..."
+    )
     parser.add_argument("--folder", type=Path, default=Path("results/skill_by_fabric"))
     a = parser.parse_args()
     if a.published:

@@ -7,6 +7,7 @@ sheet is its shear modulus times its thickness.
 
 import math
 
+import numpy as np
 from jaxtyping import Array, Float
 
 GRAVITY = 9.81  # [m/s^2], downwards
@@ -27,6 +28,11 @@ def not_negative(unit: str, **numbers: float | int) -> None:
     for name, value in numbers.items():
         if not (math.isfinite(value) and value >= 0):
             raise ValueError(f"{name} must not be negative [{unit}], found {value}")
+
+
+def millimetres(length: float | np.floating) -> str:
+    """A length [m] for people, in three digits."""
+    return f"{1e3 * length:.3g} mm" if math.isfinite(length) else "unknown"
 
 
 def isotropic_membrane(

@@ -271,6 +271,7 @@ def _draw(path: Path, outcome: "Outcome") -> None:
 
     from r2s.estimation import held_out
     from r2s.estimation.method import COARSEST
+    from r2s.metrics.prediction_error import predict_motion
     from r2s.recordings.open import SimulatedCloth
     from r2s.scenarios.resolution import matching_shape
     from r2s.viewer.comparison import draw_estimate
@@ -282,6 +283,7 @@ def _draw(path: Path, outcome: "Outcome") -> None:
     first = min(recordings, key=lambda each: each.info.scenario == "stretching")
     shape = matching_shape(estimate.shape or COARSEST, first.info.sheet.size)
     air = held_out.air_found(estimate, recordings)
-    scenario, x = held_out.motion(first, estimate.fabric, shape, air)
+    scenario = held_out.in_steps(first, shape, air)
+    x = predict_motion(scenario, estimate.fabric).x
     sheet = SimulatedCloth(x, np.asarray(scenario.scene.mesh.faces))
     draw_estimate(path, estimate, outcome.space, first, sheet)

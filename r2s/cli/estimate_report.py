@@ -186,7 +186,8 @@ def agreement(
 
 
 def _agree(agreed: Agreement, names: Sequence[str]) -> str:
-    alone = [name for name, directions in zip(names, agreed.told, strict=True) if not directions]
+    pairs = zip(names, agreed.determined, strict=True)
+    alone = [name for name, directions in pairs if not directions]
     left = f"; too little information to compare: {', '.join(alone)}" if alone else ""
     if not agreed.is_excused:
         return f"the recordings agree (p = {agreed.p:.2g}){left}"

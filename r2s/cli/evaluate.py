@@ -57,8 +57,9 @@ class Evaluate:
         check_picture(self.plot)
         card, lines = load_card(self.fabric), []
         judged: dict[str, Judged] = {}
-        for recording in open_recordings(self.recordings):
-            evaluation = self._judge(card, recording)
+        recordings = list(open_recordings(self.recordings))
+        for recording in recordings:
+            evaluation = self._judge(card, recording, recording is recordings[-1])
             judged[recording.info.name] = evaluation
             lines += evaluation.lines(recording.info.name, self.all)
         if not judged:
@@ -74,22 +75,22 @@ class Evaluate:
         print_result(self.json, result, lines)
         return 1 if failures else 0
 
-    def _judge(self, card: "Card", recording: "Recording") -> "Judged":
+    def _judge(self, card: "Card", recording: "Recording", is_last: bool) -> "Judged":
         from r2s.cli.common import choose_shape
         from r2s.estimation.cards import fingerprint
+        from r2s.estimation.held_out import in_steps
         from r2s.materials import prior
         from r2s.metrics import prediction_error
         from r2s.recordings.checks import mean_distance, point_noise
-        from r2s.scenarios.scenario import from_recording
 
         info, fabric = recording.info, card.fabric
         shape, mesh, words = choose_shape(self.shape, fabric, info.sheet.size, info.scenario)
-        scenario = from_recording(recording, shape)
+        scenario = in_steps(recording, shape)
         motion = prediction_error.predict_motion(scenario, fabric)
         metrics = prediction_error.against_motion(recording, motion.x, shape=shape)
         guess = prediction_error.predict_motion(scenario, prior.middle(float(fabric.density)))
         guessed = prediction_error.against_motion(recording, guess.x, shape=shape)
-        if self.plot is not None:
+        if self.plot is not None and is_last:
             self._draw(self.plot, recording, scenario.scene.mesh.faces, motion.x, guess.x)
         failed = math.isnan(metrics[DISTANCE])
         own = fingerprint(recording) in {digest for _, digest in card.provenance.recordings}
@@ -125,11 +126,15 @@ class Judged(NamedTuple):
 
     def lines(self, name: str, with_all: bool) -> list[str]:
         """For people."""
+        from r2s._util.units import millimetres
+
         if self.failure:
             return [f"{name}: the simulation {self.failure}"]
+        distances = self.metrics[DISTANCE], self.prior_mean, self.noise
+        own, guess, noise = map(millimetres, distances)
         lines = [
-            f"{name}: mean distance of all points {_mm(self.metrics[DISTANCE])}; prior mean "
-            f"{_mm(self.prior_mean)}; the noise of its points allows {_mm(self.noise)}",
+            f"{name}: mean distance of all points {own}; prior mean {guess}; the noise of its "
+            f"points allows {noise}",
             *(f"    {words}" for words in self.words),
         ]
         if self.is_own:
@@ -138,12 +143,8 @@ class Judged(NamedTuple):
             )
         if with_all:
             for metric, value in self.metrics.items():
-                text = f"{value:.4f}" if metric.startswith("paper_") else _mm(value)
+                text = f"{value:.4f}" if metric.startswith("paper_") else millimetres(value)
                 words = EXPLAINED.get(metric.removesuffix("_cropped"), "")
                 words += CROPPED * metric.endswith("_cropped")
                 lines.append(f"    {metric:29s}{text:>10s}  {words}")
         return lines
-
-
-def _mm(value: float) -> str:
-    return f"{1e3 * value:.2f} mm" if math.isfinite(value) else "unknown"

@@ -56,8 +56,8 @@ class Agreement(NamedTuple):
     """Whether the recordings of an estimate are of one fabric, see `r2s.estimation.consistency`.
 
     - `p`: p-value of their scatter, were they of one fabric, [-].
-    - `told`: number of directions of the fabric's space that each recording determines beyond the
-      prior and the error of its mesh: without any it was not compared.
+    - `determined`: number of directions of the fabric's space that each recording determines
+      beyond the prior and the error of its mesh: without any it was not compared.
     - `contradiction`: the one that contradicts the others; None where all agree.
     - `density`: with which they would agree best, relative to the given one, [-], and the standard
       error of its logarithm; None: that was not estimated.
@@ -65,7 +65,7 @@ class Agreement(NamedTuple):
     """
 
     p: float
-    told: tuple[int, ...]
+    determined: tuple[int, ...]
     contradiction: Contradiction | None
     density: tuple[float, float] | None = None
     exact: float | None = None
@@ -341,7 +341,8 @@ def _agreement(stored: dict[str, Any]) -> Agreement:
     if odd is not None:
         odd = Contradiction(**odd | {"values": tuple(odd["values"])})
     density = None if density is None else tuple(density)
-    return Agreement(stored["p"], tuple(stored["told"]), odd, density, stored.get("exact"))
+    determined = stored.get("determined") or stored["told"]  # until 0.3.0
+    return Agreement(stored["p"], tuple(determined), odd, density, stored.get("exact"))
 
 
 def _numbers(values: Any) -> np.ndarray:

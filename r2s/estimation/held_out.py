@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import jax.random as jr
 import numpy as np
-from jaxtyping import Float
 
+from r2s._util.units import millimetres
 from r2s.compilation import clear_in_time
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.mesh_refinement import in_mesh_steps
@@ -67,13 +67,15 @@ class HeldOut(NamedTuple):
         """One line: the errors, and what they say; a warning where the prior is as good."""
         diverged = f", {self.diverged} more diverged" if self.diverged else ""
         errors = self.defaults or (np.nan,)
-        error = f"{_mm(self.error)} mm" if np.isfinite(self.error) else "the simulation diverged"
+        middle, average, least, most = map(
+            millimetres, (self.middle, self.average, min(errors), max(errors))
+        )
+        error = millimetres(self.error) if np.isfinite(self.error) else "the simulation diverged"
         air = "" if self.air == 1 else f" (all in air {self.air:.2f} times as dense, as found)"
         words = (
             f"held-out motion {self.recording}: mean distance {error}; prior mean "
-            f"{_mm(self.middle)} mm; prior samples {_mm(self.average)} mm on average "
-            f"({_mm(min(errors))} to {_mm(max(errors))}, {len(self.defaults)} samples{diverged})"
-            f"{air}"
+            f"{middle}; prior samples {average} on average "
+            f"({least} to {most}, {len(self.defaults)} samples{diverged}){air}"
         )
         if not self.is_discriminating:
             return f"{words}: fabrics hardly differ in this motion, no verdict"
@@ -166,21 +168,14 @@ def air_found(estimate: Estimate, recordings: Sequence[Recording]) -> float:
     return next((n.value for n in estimate.nuisances if n.name == AIR), 1.0)
 
 
-def motion(
-    recording: Recording, fabric: Fabric, shape: tuple[int, int], air: float = 1.0
-) -> tuple[Scenario, Float[np.ndarray, "frame vertex 3"]]:
+def in_steps(recording: Recording, shape: tuple[int, int], air: float = 1.0) -> Scenario:
     """The scenario of a recording on a mesh of `shape` vertices in the steps of an estimate, with
-    `air` times the density of the air [-]; and a fabric's positions in it, [m]."""
+    `air` times the density of the air [-]."""
     scenario = in_denser_air(from_recording(recording, shape), air)
-    scenario = in_mesh_steps(scenario, recording.info.scenario, shape)
-    return scenario, prediction_error.predict_motion(scenario, fabric).x
+    return in_mesh_steps(scenario, recording.info.scenario, shape)
 
 
 def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int], air: float) -> float:
-    _, x = motion(recording, fabric, shape, air)
+    x = prediction_error.predict_motion(in_steps(recording, shape, air), fabric).x
     away = prediction_error.from_surface(recording, x, shape)
     return float(np.mean(away)) if np.isfinite(away).all() else float("inf")
-
-
-def _mm(value: float | np.floating) -> str:
-    return f"{1e3 * float(value):.1f}" if np.isfinite(value) else "-"

@@ -5,6 +5,7 @@ The words and figures are those of its JSON object (`r2s.estimation.estimate.as_
 
 import numpy as np
 
+from r2s._util.units import millimetres
 from r2s.estimation.estimate import Estimate, Fit, Nuisance
 
 HEADER = ("parameter", "estimate", "90 % interval", "posterior/prior")
@@ -81,11 +82,11 @@ def _table(estimate: Estimate) -> list[str]:
 
 def _fit(fit: Fit, mesh: str) -> str:
     outliers = f"without the {100 * fit.outliers:.1f} % outliers"
-    words = [f"fit to {fit.recording}: mean distance {_mm(fit.distance)} {outliers}"]
+    words = [f"fit to {fit.recording}: mean distance {millimetres(fit.distance)} {outliers}"]
     if np.isfinite(fit.noise):
-        words.append(f"the noise of its points allows {_mm(fit.noise)}")
+        words.append(f"the noise of its points allows {millimetres(fit.noise)}")
     if np.isfinite(fit.mesh):
-        words.append(f"a prediction{mesh} is expected to be {_mm(fit.mesh)} off")
+        words.append(f"a prediction{mesh} is expected to be {millimetres(fit.mesh)} off")
     return "; ".join(words)
 
 
@@ -108,7 +109,3 @@ def _search(estimate: Estimate, mesh: str) -> list[str]:
     else:
         words += "; no other start was tried"
     return [f"search{mesh}: {words}, {estimate.seconds:.0f} s"]
-
-
-def _mm(value: float) -> str:
-    return f"{1e3 * value:.2g} mm"

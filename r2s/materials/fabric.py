@@ -21,6 +21,7 @@ NUMBERS = {
     "mass_damping": "1/s",
 }
 POSITIVE = "density", "thickness"
+HEAVIEST = 20.0  # [kg/m^2]: above, an areal density was meant in g/m^2
 
 
 class Fabric(eqx.Module):
@@ -104,6 +105,10 @@ def check_fabric(fabric: Any, may_lack: bool = False) -> None:
         if not least >= 0 or (must_be_positive and least == 0):
             word = "positive" if must_be_positive else "not negative"
             raise ValueError(f"fabric: {name} must be {word} [{unit}], found {least}")
+    heaviest = float(np.max(np.asarray(fabric.density)))
+    if heaviest > HEAVIEST:
+        grams = f"{heaviest / 1e3:g} if that is in g/m^2"
+        raise ValueError(f"fabric: density must be in kg/m^2, found {heaviest:g}: {grams}")
 
 
 def constant_laws(fabric: Fabric) -> tuple[OrthotropicMembrane, PlateBending]:

@@ -74,6 +74,7 @@ positive = st.floats(1e-12, 1e9, allow_subnormal=False)
 def test_a_fabric_comes_back_bit_by_bit(tmp_path_factory, numbers, coupling, bits):
     c11, c22, c33, density, bending, damping, thickness = numbers
     c12 = coupling * float(np.sqrt(c11) * np.sqrt(c22))
+    density = min(density, 20.0)  # kg/m^2: more is refused
     fabric = Fabric.make(density, (c11, c12, c22, c33), bending, damping, 0.5, thickness)
     kind = np.float32 if bits == 32 else np.float64
     fabric = jax.tree.map(lambda leaf: leaf.astype(kind), fabric)

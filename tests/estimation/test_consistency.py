@@ -72,7 +72,7 @@ def test_recordings_of_one_fabric_agree_and_that_of_another_is_named(lifts):
     first, second, other, place = lifts
     assert judged((first,), place) is None
     agreed = judged((first, second), place)
-    assert agreed is not None and agreed.contradiction is None and min(agreed.told) > 2
+    assert agreed is not None and agreed.contradiction is None and min(agreed.determined) > 2
     apart = judged((first, other, second), place)
     assert apart is not None and apart.p < 1e-6
     odd = apart.contradiction

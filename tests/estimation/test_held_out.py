@@ -120,14 +120,14 @@ def test_a_run_that_diverged_is_no_better_than_anything():
         assert lost.describe().startswith("warning")
     assert "diverged" in HeldOut("fling", float("inf"), (1e-2,), 0, 1e-2).describe()
     nothing_else = HeldOut("fling", 4e-3, (8e-3, 12e-3), 0, float("inf"))
-    assert nothing_else.is_better and "prior mean - mm" in nothing_else.describe()
+    assert nothing_else.is_better and "prior mean unknown" in nothing_else.describe()
 
 
 def test_the_line_says_better_or_warns():
     good = HeldOut("fling", 4e-3, (8e-3, 12e-3), 1, 9e-3).describe()
     assert good == (
-        "held-out motion fling: mean distance 4.0 mm; prior mean 9.0 mm; prior samples 10.0 mm on "
-        "average (8.0 to 12.0, 2 samples, 1 more diverged): better than the prior mean and every "
+        "held-out motion fling: mean distance 4 mm; prior mean 9 mm; prior samples 10 mm on "
+        "average (8 mm to 12 mm, 2 samples, 1 more diverged): better than the prior mean and every "
         "sample"
     )
     apart = (8e-3, 12e-3)

@@ -65,6 +65,7 @@ def test_density_and_thickness_must_be_positive(density, thickness):
         (0.1, (1.0, -1.0, 1.0, 1.0), 1e-5, "C12.2 must be less than C11 C22"),
         (0.1, (1.0, 0.0, 1.0, 1.0), -1e-5, "bending.stiffness must be not negative"),
         (float("nan"), (1.0, 0.0, 1.0, 1.0), 1e-5, "density must be positive"),
+        (300.0, (1.0, 0.0, 1.0, 1.0), 1e-5, "0.3 if that is in g/m"),
     ],
 )
 def test_a_fabric_out_of_its_physical_range_is_refused(density, membrane, bending, reason):
