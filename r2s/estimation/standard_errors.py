@@ -389,10 +389,12 @@ def _posterior(
 
 
 def _positive(covariance: Matrix) -> Matrix:
-    """A covariance without the negative variances that rounding leaves in single precision."""
-    deviation = np.sqrt(np.diag(covariance))
+    """A covariance without the negative or zero variances that rounding leaves in single
+    precision."""
+    least = np.finfo(np.float32).eps  # an exact fit has no error at all
+    deviation = np.sqrt(np.maximum(np.diag(covariance), least**2))
     sizes, axes = np.linalg.eigh(covariance / np.outer(deviation, deviation))
-    sizes = np.maximum(sizes, len(sizes) * np.finfo(np.float32).eps)
+    sizes = np.maximum(sizes, len(sizes) * least)
     return (axes * sizes[None]) @ axes.T * np.outer(deviation, deviation)
 
 

@@ -122,6 +122,17 @@ def test_what_is_known_limits_the_errors_of_an_estimate_that_stays_but_for_the_w
     np.testing.assert_allclose(far, 0.04, rtol=1e-3)
 
 
+def test_an_exact_fit_has_the_error_of_its_mesh(lifted):
+    """Its own variance is below the least number of single precision."""
+    size = theta_length((lifted,))
+    end, _ = valley(lifted, size)
+    of_mesh = np.diag(np.full(size, 0.04))
+    other, error = OtherMesh((lifted,), factor(0.5)), (np.full(size, 0.2), of_mesh)
+    nothing = np.zeros((size, size))
+    _, found, _ = with_mesh_error((lifted,), other, end, jnp.ones(()), nothing, error)
+    np.testing.assert_allclose(found, of_mesh, atol=1e-9)
+
+
 def test_what_tests_measured_draws_an_estimate_only_as_far_as_the_finer_mesh_allows(
     lifted, monkeypatch
 ):
