@@ -26,7 +26,7 @@ from r2s.estimation.estimate import Nuisance
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, Problems, motion_alone
 from r2s.materials.fabric import Fabric
 from r2s.scenarios.energy import clamp_force, energy_balance
-from r2s.scenarios.scenario import Scenario, in_denser_air, resized, rollout
+from r2s.scenarios.scenario import Scenario, at_frames, in_denser_air, resized, rollout
 
 REMEMBERED = 128_000_000  # bytes of derivatives: a lift on 33 x 33 vertices takes 9 MB
 
@@ -258,38 +258,38 @@ def _conditions(problem: Problem, theta: Theta):
 
 
 def _move(problem: Problem, theta: Theta):
-    """Vertices at all frames [m] and the clamp's force at those that count [N]; whether finite."""
+    """Vertices at all simulated frames [m], with their velocities [m/s] where `is_between`, and the
+    clamp's force at the frames that count [N]; whether all is finite."""
     scenario, fabric, solver = _conditions(problem, theta)
+    simulated = dataclasses.replace(scenario, frame_times=None)
+    force = None
     if problem.force is None:
-        moved = rollout(scenario, fabric, solver=solver, frames=problem.wanted)
-        return (moved.x, None), jnp.all(moved.ok)
-    balance = energy_balance(scenario, fabric, solver=solver)
-    force = clamp_force(scenario, balance)[jnp.array(problem.frames)]
-    return (balance.x, force @ problem.force.directions.T), jnp.all(jnp.isfinite(balance.x))
+        moved = rollout(simulated, fabric, solver=solver, frames=problem.wanted)
+        ok = jnp.all(moved.ok)
+    else:
+        moved = energy_balance(simulated, fabric, solver=solver)
+        on_clamp = clamp_force(scenario, moved)[jnp.array(problem.frames)]
+        force, ok = on_clamp @ problem.force.directions.T, jnp.all(jnp.isfinite(moved.x))
+    x = jnp.stack([moved.x, moved.v], axis=1) if is_between(problem) else moved.x
+    return (x, force), ok
 
 
-def _seen_from(problem: Problem, x: Float[Array, "all 3"] | Array, theta: Theta):
-    """Vertices of all frames in the cameras' frame, at the frames that count of their clock."""
+def is_between(problem: Problem) -> bool:
+    """Whether frames may lie between those that are simulated: at uneven times, or where the
+    cameras' clock is in doubt."""
+    return problem.scenario.frame_times is not None or problem.nuisance_prior.time > 0
+
+
+def _seen_from(problem: Problem, x: Array, theta: Theta):
+    """What `_move` gives, in the cameras' frame, at the frames that count of their clock: where
+    that is late by some time, a frame is of an earlier one."""
     prior, own = problem.nuisance_prior, theta[problem.space.dim + len(SHARED) :]
-    x = _delayed(x, prior.time * own[4] / problem.scenario.interval)[jnp.array(problem.frames)]
+    if is_between(problem):
+        x, _ = at_frames(problem.scenario, x[:, 0], x[:, 1], prior.time * own[4])
+    x = x[jnp.array(problem.frames)]
     pivot = x[:, problem.scenario.scene.pinned[:1]]
     cosine, sine = jnp.cos(prior.turn * own[3]), jnp.sin(prior.turn * own[3])
     turn = jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
     offset = x - pivot
     turned = jnp.concatenate([offset[..., :2] @ turn.T, offset[..., 2:]], axis=-1)
     return pivot + turned + (jnp.asarray(prior.shifts, x.dtype) * own[:3])[None, None]
-
-
-def _delayed(x: Float[Array, "all vertex 3"], delay: Float[Array, ""]) -> Array:
-    """The motion `delay` frames earlier, by cubic interpolation (Catmull and Rom 1974).
-
-    A frame of a camera whose clock is late is of an earlier time. At rest beyond the ends.
-    """
-    places = jnp.arange(x.shape[0]).astype(x.dtype) - delay
-    whole = jax.lax.stop_gradient(jnp.floor(places))
-    part = (places - whole)[:, None, None]
-    steps = [jnp.clip(whole.astype(int) + step, 0, x.shape[0] - 1) for step in (-1, 0, 1, 2)]
-    before, left, right, after = (x[step] for step in steps)
-    slope, curve = (right - before) / 2, before - 2.5 * left + 2 * right - after / 2
-    twist = (after - before) / 2 + 1.5 * (left - right)
-    return left + part * (slope + part * (curve + part * twist))

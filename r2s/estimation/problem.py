@@ -145,7 +145,8 @@ class Problem(eqx.Module):
     - `frames`: which frames of the scenario count.
     - `clouds`, `markers`, `force`: the observations in them; None: there are none.
     - `expected`: which parts of the sheet must be observed; None: the cameras are unknown.
-    - `wanted`: how many frames of the scenario have to be simulated; None: all.
+    - `wanted`: how many frames of the scenario have to be simulated; None: all. (Those that its
+      recorded frames may lie between, see `r2s.scenarios.scenario.Scenario`.)
     - `weight`: of a frame beside those of other recordings of the fabric, [1/m^2] (only ratios
       count): one over the variance of a distance; None: 1, of all recordings.
     - `solver`: None: the cloth.
@@ -200,7 +201,8 @@ class Problem(eqx.Module):
             expected = _expected(recording, scenario, frames, seed)
             thinned = subsample(recording, num_points, None, seed)
             clouds = Clouds(thinned.points[frames], thinned.mask[frames])
-            if as_seen and scenario.brake is not None and first == 0:
+            begins = first == 0 and float(scenario.places[0]) < 1e-3
+            if as_seen and scenario.brake is not None and begins:
                 middle = space(jnp.full(space.dim, 0.5, float))
                 scenario = start_as_seen(scenario, middle, clouds.points[0], clouds.mask[0])
         return cls(
@@ -274,7 +276,7 @@ def motion_alone(problem: Problem) -> Problem:
 
 
 def _wanted(problem: Problem) -> Int[Array, ""]:
-    """The number of frames up to the last observed one, on the cameras' clock."""
+    """The number of simulated frames up to the last observed one, on the cameras' clock."""
     masks = []
     if problem.clouds is not None:
         masks.append(jnp.any(problem.clouds.mask, axis=1))
@@ -282,7 +284,9 @@ def _wanted(problem: Problem) -> Int[Array, ""]:
         masks.append(jnp.any(problem.markers.seen, axis=1))
     if not masks:
         return jnp.asarray(problem.scenario.num_frames)
-    last = jnp.max(jnp.where(jnp.any(jnp.stack(masks), axis=0), jnp.array(problem.frames), 0))
+    places = problem.scenario.places[jnp.array(problem.frames)]
+    last = jnp.max(jnp.where(jnp.any(jnp.stack(masks), axis=0), places, 0))
+    last = jnp.ceil(last).astype(int)
     late = CLOCK * problem.nuisance_prior.time / problem.scenario.interval
     return jnp.minimum(last + BETWEEN + math.ceil(late), problem.scenario.num_frames)
 
@@ -427,7 +431,8 @@ def start_as_seen(
     that the cloud does not show.
     """
     scene = scenario.scene
-    first = _rollout(dataclasses.replace(scenario, num_frames=1), fabric).x[0]
+    alone = dataclasses.replace(scenario, num_frames=1, frame_times=None)
+    first = _rollout(alone, fabric).x[0]
     start = registered(points, mask, first, scene.mesh, scene.is_free)
     path = scenario.path.at[0].set(scenario.path[1])
     return dataclasses.replace(scenario, start=start, path=path)

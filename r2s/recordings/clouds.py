@@ -40,47 +40,32 @@ def numbers(what: str, values: Any, *shape: int | str) -> Float[np.ndarray, "...
     return array
 
 
-def find_numbered(
-    folder: Path | str, suffixes: Collection[str], first: int | None = None
-) -> dict[int, Path]:
-    """The files of a folder by the last number in their names (`000.npy`, `frame_12.npy`).
+def list_frames(folder: Path | str, suffixes: Collection[str]) -> list[Path]:
+    """The files of a folder with one of the `suffixes` and a number in their names, sorted.
 
-    All must have one of the `suffixes`; others are skipped. `first`: the number that the first file
-    must have. Raises FileNotFoundError or ValueError that names the folder and the frame.
+    Raises FileNotFoundError where there are none, ValueError for several formats; both name the
+    folder.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder")
-    frames: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
-        digits = re.findall(r"[0-9]+", path.stem)
-        is_frame = digits and path.suffix.lower() in suffixes and not path.name.startswith(".")
-        if not is_frame or not path.is_file():
-            continue
-        other = frames.setdefault(int(digits[-1]), path)
-        if other != path:
-            raise ValueError(
-                f"{folder}: frame {int(digits[-1])} is there twice: {other.name} and {path.name}: "
-                "remove one"
-            )
-    if not frames:
+    files = [
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in suffixes
+        and not path.name.startswith(".")
+        and re.search("[0-9]", path.stem)
+        and path.is_file()
+    ]
+    if not files:
         raise FileNotFoundError(
             f"{folder}: no numbered frames such as 000{next(iter(suffixes))} "
             f"(formats: {', '.join(suffixes)})"
         )
-    formats = sorted({path.suffix.lower() for path in frames.values()})
+    formats = sorted({path.suffix.lower() for path in files})
     if len(formats) > 1:
         raise ValueError(f"{folder}: frames of mixed formats: {', '.join(formats)}")
-    start = min(frames) if first is None else first
-    if min(frames) < start:
-        raise ValueError(f"{folder}: frame {min(frames)} comes before the first frame, {start}")
-    for number in range(start, max(frames)):
-        if number not in frames:
-            raise ValueError(
-                f"{folder}: frame {number} is missing (found {len(frames)} frames from "
-                f"{min(frames)} to {max(frames)}): restore it, or number the frames without gaps"
-            )
-    return dict(sorted(frames.items()))
+    return files
 
 
 def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:

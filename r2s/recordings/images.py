@@ -8,14 +8,15 @@ from jaxtyping import Bool, Float, Num, UInt8
 
 from r2s._util.extras import require
 from r2s._util.files import write_bytes
-from r2s.recordings.clouds import find_numbered, read_values
+from r2s.recordings.clouds import read_values
 
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
-    """The frames of a video, or of a folder of numbered images (`find_numbered`), as grey images.
+    """The frames of a video, or of a folder of numbered images (`r2s.recordings.clocks`), as
+    grey images.
 
     Raises FileNotFoundError, ImportError (names the extra), or ValueError (file and frame).
     """
@@ -34,7 +35,9 @@ def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
 
 def _images(folder: Path) -> Iterator[tuple[Path, np.ndarray]]:
     cv2 = require("cv2", "camera", "videos and images")
-    for file in find_numbered(folder, IMAGES).values():
+    from r2s.recordings.clocks import find_frames
+
+    for file in find_frames(folder, IMAGES).files:
         if file.suffix.lower() == ".png":
             read_png(file)  # of a cut one OpenCV takes the rows that are there
         image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)

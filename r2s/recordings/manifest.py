@@ -12,9 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from r2s._util.files import read_json
-from r2s._util.units import positive
+from r2s._util.units import not_negative, positive
 from r2s.recordings.cameras import is_rotation
-from r2s.recordings.clouds import READERS, find_numbered, numbers, read_cloud, read_values
+from r2s.recordings.clocks import EPOCH, find_frames, times_of
+from r2s.recordings.clouds import READERS, read_cloud, read_values
+from r2s.recordings.gripper_paths import ORDERS, Track, merged, read_track, with_tool
 from r2s.recordings.recording import (
     MeasurementUncertainty,
     Recording,
@@ -45,22 +47,35 @@ class Transform:
             )
 
 
+IDENTITY = Transform(1.0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
+
+
 @dataclass(frozen=True)
 class Gripper:
-    """The commanded path: `file` (knot, 3) or (knot, gripper, 3), `rate` knots per second [Hz].
+    """The path of the grippers.
 
-    `offset` [m] is the place of the cloth that is held, in the world, less the commanded tool
-    point; `note` says how it was measured.
+    - `file`: as `r2s.recordings.gripper_paths.read_track` reads it; of several grippers one file
+      each, with ";" between, in the order of `pinned`. "{name}", "{fabric}" and "{trial}" stand for
+      those of a recording.
+    - `rate`: knots per second, [Hz]; 0: the file has their times, on the clock of the frames.
+    - `offset`: the place of the cloth that is held, in the world, less the tool point, [m];
+      `tool_offset`: the same in the tool's axes, which turn with the tool. `note` says how these
+      were measured.
+    - `quaternion_order`: of npz and json, "xyzw" or "wxyz".
     """
 
     file: str
-    rate: float
-    transform: Transform
-    offset: Vector
-    note: str
+    rate: float = 0.0  # [Hz]
+    transform: Transform = IDENTITY
+    offset: Vector = (0.0, 0.0, 0.0)
+    note: str = ""
+    tool_offset: Vector = (0.0, 0.0, 0.0)
+    quaternion_order: str = ""
 
     def __post_init__(self) -> None:
-        positive("Hz", rate=self.rate)
+        not_negative("Hz", rate=self.rate)
+        if self.quaternion_order not in ("", *ORDERS):
+            raise ValueError(f"quaternion_order must be xyzw or wxyz, got {self.quaternion_order}")
 
 
 @dataclass(frozen=True)
@@ -83,9 +98,13 @@ class Session:
 class Scenario:
     """How the recordings of one experiment lie on the disk and in the world.
 
-    `folder`: a regex for the whole folder name, with the groups `fabric` and `trial`. Frame i
-    (the first is numbered `first_frame`) is taken at i / frame_rate + time_offset on the
-    gripper's clock: a negative offset says that the clouds lag behind the gripper.
+    - `folder`: a regex for the whole folder name, with the groups `fabric` and `trial`.
+    - `frame_rate`: [Hz], of frames without times: one is taken at its number, less `first_frame`,
+      over this. 0: they have times, in times.csv of their folder (one line a frame, [s]) or in
+      their names (`r2s.recordings.clocks`).
+    - `time_offset`: added to the frames' times, [s]; negative where they lag behind the grippers.
+    - `frames_used`: the first and the last that count, inclusive, by their numbers less
+      `first_frame`; of frames with times in their order. Empty: all.
 
     A folder with a cameras.json holds RGB-D images (`r2s.recordings.rgbd`) instead of clouds: the
     cameras' own times or rate come before `frame_rate`, `cloud` transforms from their world, and
@@ -93,23 +112,24 @@ class Scenario:
     """
 
     folder: str
-    frame_rate: float  # [Hz]
-    time_offset: float  # [s]
-    cloud: Transform
     gripper: Gripper
     sheet: SheetPlacement
-    table_height: float  # [m]
-    frames_used: tuple[int, int]  # first and last, inclusive
-    drop_repeats: bool  # keep one of points that are equal
+    frame_rate: float = 0.0  # [Hz]
+    time_offset: float = 0.0  # [s]
+    cloud: Transform = IDENTITY
+    table_height: float = 0.0  # [m]
+    frames_used: tuple[int, ...] = ()
+    drop_repeats: bool = False  # keep one of points that are equal
     first_frame: int = 0
     sessions: tuple[Session, ...] = ()
     doubt: MeasurementUncertainty | None = None
     views: Views | None = None
 
     def __post_init__(self) -> None:
-        positive("Hz", frame_rate=self.frame_rate)
-        if not 0 <= self.frames_used[0] <= self.frames_used[1]:
-            raise ValueError(f"frames_used must be [first, last], found {self.frames_used}")
+        not_negative("Hz", frame_rate=self.frame_rate)
+        used = self.frames_used
+        if used and not (len(used) == 2 and 0 <= used[0] <= used[1]):
+            raise ValueError(f"frames_used must be [first, last], found {list(used)}")
         try:
             groups = re.compile(self.folder).groupindex
         except re.error as error:
@@ -202,9 +222,10 @@ def sources(folder: Path | str, manifest: Manifest, name: str) -> list[Path]:
     Its manifest, the gripper's path, cameras.json, and all in its folder but colour images.
     """
     folder = Path(folder)
-    gripper = folder / _scenario_of(manifest, name)[1].gripper.file
+    _, scenario, match = _scenario_of(manifest, name)
+    grippers = _gripper_files(folder, scenario, name, match)
     inside = (path for path in (folder / name).rglob("*") if path.parent.name != "colour")
-    files = (manifest_of(folder), gripper, find_rig(folder / name), *inside)
+    files = (manifest_of(folder), *grippers, find_rig(folder / name), *inside)
     return sorted({path for path in files if path is not None and path.is_file()})
 
 
@@ -222,17 +243,19 @@ def read_recording(
     """
     folder = Path(folder)
     scenario_name, scenario, match = _scenario_of(manifest, name)
-    path = _read_path(folder / scenario.gripper.file)
+    files = _gripper_files(folder, scenario, name, match)
+    track, held = _held(files, scenario.gripper)
     if find_rig(folder / name):
         rig = read_rig(folder / name)
         times, clouds = read_clouds(folder / name, rig, scenario.frame_rate, watch)
-        verified = None
+        verified, numbers = None, list(range(len(times)))
     else:
-        frames = list(find_numbered(folder / name, READERS, scenario.first_frame).values())
-        times = np.arange(len(frames)) / scenario.frame_rate
-        clouds = [read_cloud(frame) for frame in watch(frames)]
-        files = {f"{name}/{frame.name}": c for frame, c in zip(frames, clouds, strict=True)}
-        verified = _verify(manifest.files, name, files | {scenario.gripper.file: path})
+        frames = find_frames(folder / name, READERS, scenario.first_frame)
+        times, numbers = times_of(folder / name, frames, scenario.frame_rate), frames.numbers
+        clouds = [read_cloud(frame) for frame in watch(frames.files)]
+        values = {f"{name}/{f.name}": c for f, c in zip(frames.files, clouds, strict=True)}
+        values |= {f.name: read_values(f) for f in files if f.suffix == ".npy"}
+        verified = _verify(manifest.files, name, values)
         if scenario.drop_repeats:
             clouds = [_distinct(points) for points in clouds]
     shift, views = (0.0, 0.0, 0.0), scenario.views
@@ -251,7 +274,7 @@ def read_recording(
         fabric=match["fabric"],
         trial=match["trial"] or "1",
         source=source if verified else str(folder / name),
-        frames_used=scenario.frames_used,
+        frames_used=_used(folder / name, scenario.frames_used, numbers),
         sheet=scenario.sheet,
         table_height=scenario.table_height,
         verified=verified,
@@ -259,13 +282,71 @@ def read_recording(
         doubt=scenario.doubt,
         views=views,
     )
-    return make_recording(
-        [to_world(scenario.cloud, points) + np.array(shift) for points in clouds],
-        times + scenario.time_offset,
-        to_world(scenario.gripper.transform, path) + np.array(scenario.gripper.offset),
-        np.arange(len(path)) / scenario.gripper.rate,
-        info,
-    )
+    knots = track.times
+    start = times[0] if times[0] > EPOCH else 0.0
+    if knots is None:
+        knots = np.arange(len(held)) / scenario.gripper.rate
+    else:
+        start = knots[0]
+        knots = knots - start
+    times = times - start + scenario.time_offset
+    if times[-1] < knots[0] or times[0] > knots[-1]:
+        raise ValueError(
+            f"recording {name}: the frames go from {times[0]:g} to {times[-1]:g} s, the gripper's "
+            f"path from {knots[0]:g} to {knots[-1]:g} s: they are not on one clock; give their "
+            "difference as time_offset [s]"
+        )
+    points = [to_world(scenario.cloud, points) + np.array(shift) for points in clouds]
+    return make_recording(points, times, held, knots, info)
+
+
+def _gripper_files(folder: Path, scenario: Scenario, name: str, match: re.Match[str]) -> list[Path]:
+    """The files of the grippers' paths of a recording."""
+    parts = {"name": name, "fabric": match["fabric"], "trial": match["trial"] or "1"}
+    files = scenario.gripper.file
+    for key, value in parts.items():
+        files = files.replace(f"{{{key}}}", value)
+    return [folder / file.strip() for file in files.split(";")]
+
+
+def _held(files: Sequence[Path], gripper: Gripper) -> tuple[Track, np.ndarray]:
+    """The track of the grippers, and the places that they hold, in the world (knot, gripper, 3)."""
+    tracks = [read_track(file, gripper.quaternion_order) for file in files]
+    of_times = [track.times is not None for track in tracks]
+    where = ", ".join(map(str, files))
+    if any(of_times) and gripper.rate:
+        raise ValueError(f"{where}: it has times, and the manifest a rate: leave the rate out")
+    if not (any(of_times) or gripper.rate):
+        raise ValueError(f"{where}: it has no times: give the gripper's rate [Hz]")
+    turn, placed = np.array(gripper.transform.rotation), []
+    for track in tracks:
+        offset: np.ndarray | float = 0.0
+        if any(gripper.tool_offset):
+            try:
+                track, offset = with_tool(track, gripper.tool_offset)
+            except ValueError as error:
+                raise ValueError(f"{where}: {error}") from error
+            offset = offset @ turn.T
+        positions = to_world(gripper.transform, track.positions) + offset
+        placed.append(track._replace(positions=positions))
+    try:
+        track = merged(placed)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    return track, track.positions + np.array(gripper.offset)
+
+
+def _used(folder: Path, used: tuple[int, ...], numbers: Sequence[int]) -> tuple[int, int]:
+    """The first and the last frame that count, by their places, from those of their numbers."""
+    if not used:
+        return 0, len(numbers) - 1
+    places = [place for place, number in enumerate(numbers) if used[0] <= number <= used[1]]
+    if used[1] > numbers[-1] or not places:
+        raise ValueError(
+            f"{folder}: frames_used is {used[0]}..{used[1]}, but the frames are numbered 0 to "
+            f"{numbers[-1]}, counted from the first"
+        )
+    return places[0], places[-1]
 
 
 def _matching(name: str, patterns: Sequence[str], kind: str) -> tuple[int, re.Match[str]]:
@@ -282,14 +363,6 @@ def _scenario_of(manifest: Manifest, name: str) -> tuple[str, Scenario, re.Match
     known = list(manifest.scenarios.items())
     index, match = _matching(name, [scenario.folder for _, scenario in known], "scenarios")
     return *known[index], match
-
-
-def _read_path(file: Path) -> np.ndarray:
-    path = read_values(file)
-    try:
-        return numbers("the gripper path", path, "knot", *["gripper"] * (path.ndim - 2), 3)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}: expected (knot, 3) or (knot, gripper, 3)") from error
 
 
 def _verify(listed: Mapping[str, str], name: str, values: Mapping[str, np.ndarray]) -> bool | None:

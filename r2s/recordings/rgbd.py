@@ -13,111 +13,66 @@ and `cameras.json` lies there, or in the folder above for all recordings of one 
 
 import hashlib
 import itertools
-import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from r2s._util.files import read_json
 from r2s.recordings import images
 from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved
-from r2s.recordings.clouds import Cleaning, clean, find_numbered, inside
-from r2s.recordings.force_log import check_increasing, number_in, read_lines
+from r2s.recordings.clocks import Frames, find_frames, times_of
+from r2s.recordings.clouds import Cleaning, clean, inside
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
 
 NAME = "cameras.json"
-LONGEST = 5.0  # [s] between frames: above, times are taken for milliseconds or nanoseconds
+TOGETHER = 0.005  # [s]: frames of several cameras that are nearer in time are one frame
 MOST = 0.5  # of the points behind a mask: at least so many are in the workspace
 DISAGREE = 0.005  # [m]: cameras whose clouds are closer than this are not swapped
 COMPARED = 2000  # points of each cloud
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def frame_times(folder: Path, count: int, frame_rate: float) -> Float[np.ndarray, " frame"]:
-    """The times [s] of the frames of a camera: its times.csv, else by a frame rate [Hz].
-
-    Raises FileNotFoundError where there is neither, or ValueError as `read_times`.
-    """
-    path = folder / "times.csv"
-    if path.is_file():
-        times = read_times(path)
-        if len(times) != count:
-            raise ValueError(
-                f"{path}: {len(times)} times, but {count} frames in {folder / 'depth'}: "
-                "one line a frame"
-            )
-        return times
-    if frame_rate > 0:
-        return np.arange(count) / frame_rate
-    raise FileNotFoundError(f"{path}: no such file, and no frame_rate in {NAME}: give either")
-
-
-def read_times(path: Path) -> Float[np.ndarray, " frame"]:
-    """The frames' times [s] from the last column of a CSV file; a line of titles may come first.
-
-    Raises FileNotFoundError, or ValueError that names the file and the line.
-    """
-    rows = read_lines(path)
-    if rows and re.match("[A-Za-z]", rows[0][1][-1]):
-        rows = rows[1:]
-    times = np.array([number_in(path, line, cells[-1], "a time [s] last") for line, cells in rows])
-    if len(times) == 0:
-        raise ValueError(f"{path}: no times: expected one line a frame, its time [s] last")
-    check_increasing(path, [line for line, _ in rows], times)
-    interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-    if interval > LONGEST:
-        raise ValueError(
-            f"{path}: frames are {interval:g} s apart: give times in seconds, not in milliseconds "
-            "or nanoseconds"
-        )
-    return times
-
-
 def pair(
-    times: Mapping[str, Float[np.ndarray, " frame"]], tolerance: float
-) -> dict[str, Int[np.ndarray, " pair"]]:
-    """For each camera the indices of its frames, one a pair, nearest in time [s] to the first's.
+    times: Mapping[str, Float[np.ndarray, " frame"]], tolerance: float = 0.0
+) -> list[tuple[float, dict[str, int]]]:
+    """The time of each frame of a recording, [s], and the indices of the cameras' frames in it.
 
-    Frames of the first camera before or after the others ran are left out. `tolerance` is what
-    times of a pair may differ by [s], 0 for half the interval of the first camera. Raises
-    ValueError that names camera, frame and time where none is near enough, or none ran at once.
+    Frames of several cameras that lie within `tolerance` [s] of the first of them are one frame, at
+    their mean time; others stand alone. 0: `TOGETHER`, or a quarter of the shortest interval of a
+    camera if that is less.
     """
-    first, clock = next(iter(times.items()))
     if tolerance == 0:
-        tolerance = float(np.median(np.diff(clock)) / 2) if len(clock) > 1 else 0.0
-    start = max(t[0] for t in times.values()) - tolerance
-    end = min(t[-1] for t in times.values()) + tolerance
-    used = np.flatnonzero((clock >= start) & (clock <= end))
-    if len(used) == 0:
-        spans = ", ".join(f"{name} {t[0]:g} to {t[-1]:g} s" for name, t in times.items())
-        raise ValueError(f"the cameras never ran at once: {spans}: check that they share a clock")
-    pairs = {}
-    for name, other in times.items():
-        pairs[name] = np.abs(other[None] - clock[used, None]).argmin(axis=1)
-        apart = np.abs(other[pairs[name]] - clock[used])
-        if (apart > tolerance * (1 + 1e-9)).any():
-            at = int(apart.argmax())
-            raise ValueError(
-                f"frame {used[at]} of {first} at {clock[used[at]]:g} s has no frame of {name} "
-                f"within {tolerance:g} s, the nearest is at {other[pairs[name][at]]:g} s: restore "
-                "the frame, or raise pair_tolerance"
-            )
-    return pairs
+        shortest = min(float(np.diff(t).min()) for t in times.values() if len(t) > 1)
+        tolerance = min(TOGETHER, shortest / 4)
+    events = sorted((t, name, i) for name, clock in times.items() for i, t in enumerate(clock))
+    groups: list[list[tuple[float, str, int]]] = []
+    for event in events:
+        latest = groups[-1] if groups else []
+        is_near = latest and event[0] - latest[0][0] <= tolerance
+        if is_near and event[1] not in [name for _, name, _ in latest]:
+            latest.append(event)
+        else:
+            groups.append([event])
+    return [
+        (float(np.mean([t for t, _, _ in group])), {name: i for _, name, i in group})
+        for group in groups
+    ]
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a set of recordings; the first is the clock of the others.
+    """The cameras of a set of recordings, which share a clock.
 
-    - `frame_rate`: for cameras without times.csv, [Hz]; 0: all have one.
-    - `pair_tolerance`: what the times of frames that belong together may differ by, [s]; 0: half
-      the interval between the first camera's frames.
+    - `frame_rate`: for cameras without times.csv and without times in the names of their images,
+      [Hz]; 0: all have them.
+    - `pair_tolerance`: what the times of images may differ by that are one frame, [s]; 0: 5 ms, or
+      a quarter of the shortest interval if that is less. Others are frames of their own.
     """
 
     cameras: Mapping[str, DepthCamera]
@@ -197,58 +152,58 @@ def stream(
     folder = Path(folder)
     rate = rig.frame_rate or frame_rate
     files = {name: _files(folder / name, camera) for name, camera in rig.cameras.items()}
-    times = {name: frame_times(folder / name, len(files[name]), rate) for name in rig.cameras}
-    try:
-        pairs = pair(times, rig.pair_tolerance)
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from error
-    clock = next(iter(times.values()))
+    times = {name: times_of(folder / name, frames, rate) for name, (frames, _) in files.items()}
     last: dict[str, bytes] = {}
-    for frame, index in enumerate(next(iter(pairs.values()))):
+    is_compared = False
+    for frame, (time, chosen) in enumerate(pair(times, rig.pair_tolerance)):
         parts = {}
-        for name, chosen in pairs.items():
-            depth_file, mask_file = files[name][chosen[frame]]
-            parts[name] = _camera_cloud(rig, name, depth_file, mask_file, last)
-        if frame == 0:
+        for name, index in chosen.items():
+            frames, masks = files[name]
+            parts[name] = _camera_cloud(rig, name, frames.files[index], masks[index], last)
+        if not is_compared and len(parts) > 1:
+            is_compared = True
             _check_swapped(folder, rig, parts)
         cloud = clean(np.concatenate(list(parts.values())), rig.clean, frame)
         if len(cloud) == 0:
             raise ValueError(
-                f"{folder}: frame {index} at {clock[index]:g} s: no point is left in the workspace "
+                f"{folder}: frame {frame} at {time:g} s: no point is left in the workspace "
                 f"{rig.clean.workspace} [m]: check workspace, table and masks, or drop the frame"
             )
-        yield float(clock[index]), cloud
+        yield time, cloud
 
 
-def _files(folder: Path, camera: DepthCamera) -> list[tuple[Path, Path | None]]:
-    """The depth image and the mask of each frame of a camera."""
+def _files(folder: Path, camera: DepthCamera) -> tuple[Frames, list[Path | None]]:
+    """The depth images of a camera, and the mask of each."""
     if not folder.is_dir():
         raise FileNotFoundError(
             f"{folder}: no folder of the camera {folder.name!r}, which {NAME} names: "
             "restore it, or take the camera out"
         )
-    depths = find_numbered(folder / "depth", images.DEPTHS)
-    masks: Mapping[int, Path | None] = dict.fromkeys(depths)
+    depths = find_frames(folder / "depth", images.DEPTHS)
+    masks: list[Path | None] = [None] * len(depths.files)
     if camera.masks:
         if not (folder / "masks").is_dir():
             raise FileNotFoundError(
                 f"{folder / 'masks'}: no such folder: segment the fabric (SAM 2 writes such "
                 f'masks), or set "masks": false in {NAME}'
             )
-        masks = find_numbered(folder / "masks", images.MASKS)
-        _same_frames(folder, "masks", depths, masks)
+        masks = list(_same_frames(folder, "masks", depths, images.MASKS))
     if (folder / "colour").is_dir():
-        _same_frames(folder, "colour", depths, find_numbered(folder / "colour", images.COLOURS))
-    return [(depths[number], masks[number]) for number in depths]
+        _same_frames(folder, "colour", depths, images.COLOURS)
+    return depths, masks
 
 
-def _same_frames(folder: Path, kind: str, depths: Mapping[int, Any], others: Mapping) -> None:
-    for number in sorted(depths.keys() ^ others.keys()):
-        lacking, path = (kind, depths[number]) if number in depths else ("depth", others[number])
+def _same_frames(folder: Path, kind: str, depths: Frames, suffixes: Collection[str]) -> list[Path]:
+    """The images of a kind that belong to depth images, by the numbers or times in their names."""
+    others = find_frames(folder / kind, suffixes)
+    one, other = (dict(zip(each.keys, each.files, strict=True)) for each in (depths, others))
+    for key in sorted(one.keys() ^ other.keys()):
+        lacking, path = (kind, one[key]) if key in one else ("depth", other[key])
         raise ValueError(
-            f"{folder / lacking}: frame {number} is missing, but {path} exists: export it again, "
-            f"or drop the frame; depth and {kind} have the same numbers"
+            f"{folder / lacking}: no image that belongs to {path}: export it again, or drop the "
+            f"frame; depth and {kind} have the same numbers, or times, in their names"
         )
+    return [other[key] for key in one]
 
 
 def _camera_cloud(

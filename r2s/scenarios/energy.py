@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.environment.air import drag_on_vertices
-from r2s.environment.scene import Control
+from r2s.environment.scene import Control, along_path
 from r2s.materials.fabric import Fabric
 from r2s.materials.wrinkling import membrane_on_samples
 from r2s.mesh.mesh import Mesh
@@ -21,9 +21,10 @@ Energies = Float[Array, " frame"]
 
 
 class EnergyBalance(eqx.Module):
-    """A motion with its forces [N], and its energies at every frame, [J].
+    """A motion with its forces [N], and its energies, [J], at every simulated frame
+    (`r2s.scenarios.scenario.at_frames` leads to a recording's).
 
-    - `x`: positions, [m].
+    - `x`, `v`: positions [m] and velocities [m/s].
     - `forces`: of the grippers on each pinned vertex, mean since the frame before. `last`: the same
       at the frame itself, at the end of the last step.
     - `stored`: in membrane and bending; `kinetic`; `potential`: of gravity, above z = 0.
@@ -33,6 +34,7 @@ class EnergyBalance(eqx.Module):
     """
 
     x: Float[Array, "frame vertex 3"]
+    v: Float[Array, "frame vertex 3"]
     forces: Float[Array, "frame gripper 3"]
     last: Float[Array, "frame gripper 3"]
     stored: Energies
@@ -89,6 +91,7 @@ def energy_balance(
     mass = vertex_masses(mesh, fabric.density)
     return EnergyBalance(
         x=x,
+        v=v,
         forces=forces[first:],
         last=last[first:],
         stored=jax.vmap(lambda x: stored_energy(mesh, fabric, x))(x),
@@ -107,7 +110,10 @@ def clamp_force(scenario: Scenario, found: EnergyBalance) -> Float[Array, "frame
     """
     mesh, pinned = scenario.scene.mesh, scenario.scene.pinned
     pulled = mesh.rest[pinned, 0] > jnp.max(mesh.rest[:, 0]) / 2
-    return jnp.sum(jnp.where(pulled[None, :, None], found.last, 0), axis=1)
+    force = jnp.sum(jnp.where(pulled[None, :, None], found.last, 0), axis=1)
+    if scenario.frame_times is None:
+        return force
+    return along_path(scenario.places, jnp.arange(len(force)).astype(float), force[:, None])[:, 0]
 
 
 def stored_energy(mesh: Mesh, fabric: Fabric, x: Float[Array, "vertex 3"]) -> Float[Array, ""]:

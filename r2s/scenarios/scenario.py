@@ -19,13 +19,16 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import TurnedMembrane
 from r2s.mesh.mesh import Mesh, corner, rectangle
 from r2s.mesh.mesh import resized as resized_mesh
-from r2s.recordings.recording import Recording, SheetPlacement
+from r2s.recordings.recording import Recording, SheetPlacement, interpolated
 from r2s.scenarios.paths import Route
 from r2s.solvers.implicit.cloth import MAX_ITERATIONS, ImplicitCloth, prepare_mesh
-from r2s.solvers.simulate import Solution, Solver, simulate
+from r2s.solvers.simulate import Solution, Solver, between, simulate
 
 CLEARANCE = 1e-3  # [m], between the table and a sheet that lies on it
 LEAD_IN = 0.5  # [s], in which the grippers go from the sheet at rest to where their path begins
+GRID = 0.0125  # [s], at least a step: between the states that frames at uneven times lie between
+EVEN = 1e-3  # of the interval, by which frames may deviate from even times
+STILL = 1e-4  # [m], within which a gripper has not moved yet
 MAX_STEP = 0.025  # [s]: 1 mm from the limit of small steps in a lift of 2.5 s, by measurement
 SETTLING = 3.0  # [s], in which a sheet that hangs comes to rest before the first frame
 BRAKE = 8.0  # [1/s], mass damping meanwhile: of a sheet of 0.45 m 4e-11 of the energy remain
@@ -82,6 +85,8 @@ class Scenario(eqx.Module):
     - `interval`: between frames, [s].
     - `num_frames`, `lead_in`: frames that count from the first, and frames simulated before it.
     - `substeps`: steps between frames, from `steps_between`.
+    - `frame_times`: [s], of frames that are not evenly spaced, or begin after the motion. They are
+      interpolated between those of the four fields above, see `at_frames`. None: they are these.
     - `wind`, `wind_times`: of the air, [m/s] and [s], linear between; None: still air.
     - `brake`: mass damping [1/s] before the first frame, beside the fabric's; None: none.
     - `acceleration`: at the start, [m/s^2], of a sheet that is let go there; None: it is at rest.
@@ -104,12 +109,20 @@ class Scenario(eqx.Module):
     brake: Float[Array, ""] | None = None
     acceleration: Float[Array, "vertex 3"] | None = None
     turn: Float[Array, ""] | None = None
+    frame_times: Float[Array, " frame"] | None = None
     self_contact: bool = eqx.field(static=True, default=False)
     layout: Layout | None = eqx.field(static=True, default=None)
 
     def __post_init__(self) -> None:
         if self.layout is None:
             self.layout = Layout(self.scene.mesh)
+
+    @property
+    def places(self) -> Float[Array, " frame"]:
+        """Where the frames are among those that are simulated, which count from 0."""
+        if self.frame_times is None:
+            return jnp.arange(self.num_frames).astype(float)
+        return (self.frame_times - self.first_time) / self.interval
 
     def controls(self, substeps: int) -> Control:
         """What grippers and air do at the end of every step, of `substeps` between frames."""
@@ -151,20 +164,33 @@ class Experiment(NamedTuple):
         """On a mesh of `shape` vertices along warp and weft, made of `elements`
         (`r2s.mesh.mesh.rectangle`); with `self_contact` it does not pass through itself.
 
-        Before the first frame the grippers go from the sheet's corners to where the path begins; a
-        sheet that hangs also comes to rest, braked by `BRAKE` for `SETTLING`. Raises `ValueError`
-        when the frames are not evenly spaced.
+        Before the first frame, or before a gripper moves where that is earlier, the grippers go
+        from the sheet's corners to where the path begins; a sheet that hangs also comes to rest,
+        braked by `BRAKE` for `SETTLING`. Frames may come at any times.
         """
-        sheet, times = self.sheet, np.asarray(self.times)
-        path_times, path = (jnp.asarray(part, float) for part in self.route)
-        interval = _interval(times)
+        sheet, times = self.sheet, np.asarray(self.times, np.float64)
+        route = Route(*(np.asarray(part, np.float64) for part in self.route))
+        start_time, route = _from_rest(route, float(times[0]))
+        path_times, path = (jnp.asarray(part, float) for part in route)
+        interval, is_even = _interval(times)
+        # whole intervals before the first frame, so that steps end at frames where they can
+        ahead = math.ceil((times[0] - start_time) / interval - EVEN)
+        start_time, is_even = float(times[0]) - ahead * interval, is_even and not ahead
         mesh = rectangle(sheet.size, shape, elements)
         start, hangs = _at_rest(sheet, np.asarray(mesh.rest), self.table_height)
         pinned, shares = _grip(sheet, shape, self.clamps)
         if self.clamps:
             path = jnp.einsum("vh,khi->kvi", jnp.asarray(shares, float), path)
+        substeps = steps_between(interval, mesh, np.asarray(path), np.asarray(path_times))
+        num_frames, frame_times = len(times), None
+        if not is_even:
+            step = interval / substeps
+            substeps = max(int(GRID / step), 1)
+            interval = substeps * step
+            num_frames = math.ceil((times[-1] - start_time) / interval - 1e-6) + 1
+            frame_times = jnp.asarray(times, float)
         lead_in = math.ceil((SETTLING if hangs else LEAD_IN) / interval)
-        first, before = min(times[0], float(path_times[0])), lead_in * interval
+        first, before = min(start_time, float(path_times[0])), lead_in * interval
         knots = jnp.asarray([first - before, first - before / 2], float)
         at_rest = jnp.asarray(start[pinned], float)
         wind = self.wind if self.wind is not None and any(self.wind) else None
@@ -175,14 +201,15 @@ class Experiment(NamedTuple):
             start=jnp.asarray(start, float),
             path=jnp.concatenate([at_rest[None], path[:1], path]),
             path_times=jnp.concatenate([knots, path_times]),
-            first_time=jnp.asarray(times[0], float),
+            first_time=jnp.asarray(times[0] if is_even else start_time, float),
             interval=interval,
-            num_frames=len(times),
+            num_frames=num_frames,
             lead_in=lead_in,
-            substeps=steps_between(interval, mesh, np.asarray(path), np.asarray(path_times)),
+            substeps=substeps,
             wind=gust,
             wind_times=gust_times,
             brake=jnp.asarray(BRAKE, float) if hangs else None,
+            frame_times=frame_times,
             self_contact=self_contact,
         )
 
@@ -202,16 +229,30 @@ def _at_rest(
     return start, hangs
 
 
-def _interval(times: Float[np.ndarray, " frame"]) -> float:
-    """Between frames [s]; rounded, so that float32 times of one rate compile once."""
+def _from_rest(route: Route, first: float) -> tuple[float, Route]:
+    """When the sheet is last at rest, [s]: at the first frame, at time `first`, or where a gripper
+    moves before that; and the route from there on."""
+    moved = np.linalg.norm(route.path - route.path[0], axis=-1).max(axis=-1) > STILL
+    start = min(route.times[max(int(moved.argmax()) - 1, 0)], first) if moved.any() else first
+    if not route.times[0] < start:
+        return start, route
+    left = route.times > start
+    here = interpolated(np.array([start]), route.times, route.path)
+    return start, Route(np.r_[start, route.times[left]], np.concatenate([here, route.path[left]]))
+
+
+def _interval(times: Float[np.ndarray, " frame"]) -> tuple[float, bool]:
+    """Between frames [s], and whether all are that; else of the even times that these are nearest
+    to, some of them dropped. Rounded, so that recordings of one rate compile once."""
+    if len(times) < 2:
+        return 1.0, True
     intervals = np.diff(times)
-    interval = float(np.mean(intervals)) if len(times) > 1 else 1.0
-    if np.any(np.abs(intervals - interval) > 1e-3 * interval):
-        raise ValueError(
-            f"frames must be evenly spaced in time, got {intervals.min():g} to "
-            f"{intervals.max():g} s between them: resample the recording"
-        )
-    return round(interval, 9)
+    interval = float(np.mean(intervals))
+    if np.all(np.abs(intervals - interval) <= EVEN * interval):
+        return round(interval, 9), True
+    numbers = np.cumsum(np.maximum(np.round(intervals / np.median(intervals)), 1))
+    since = times[1:] - times[0]
+    return float(f"{numbers @ since / (numbers @ numbers):.4g}"), False
 
 
 def _grip(
@@ -315,7 +356,8 @@ def rollout(
     solver: SheetSolver | None = None,
     frames: Int[Array, ""] | int | None = None,
 ) -> Solution:
-    """How a fabric moves in a scenario, at its frames; times are those of the frames.
+    """How a fabric moves in a scenario, at its frames; times are those of the frames. Between the
+    frames that are simulated it is a cubic (`Scenario.frame_times`).
 
     By the implicit cloth, in the scenario's steps, or in so many that none is above `max_step` [s].
     Or by another `solver` of the same scene, whose step divides the time between frames, such as
@@ -323,7 +365,9 @@ def rollout(
     others repeat the last.
     """
     solver, substeps = stepped(scenario, max_step, solver)
-    skipped = scenario.lead_in - 1
+    skipped, places = scenario.lead_in - 1, scenario.places
+    if frames is not None and scenario.frame_times is not None:
+        frames = jnp.ceil(places[frames - 1]).astype(int) + 1
     motion = simulate(
         solver,
         as_cut(scenario, fabric),
@@ -333,15 +377,25 @@ def rollout(
         saves=None if frames is None else frames + skipped,
     )
     before = scenario.lead_in * scenario.interval - scenario.first_time
-    return Solution(
-        motion.x[skipped:],
-        motion.v[skipped:],
-        motion.times[skipped:] - before,
-        motion.final_state,
-        motion.ok[skipped:],
-        motion.result,
-        motion.failed_at - before,
-    )
+    saved = (part[skipped:] for part in (motion.x, motion.v, motion.times, motion.ok))
+    x, v, times, ok = saved
+    times = times - before
+    if scenario.frame_times is not None:
+        x, v = at_frames(scenario, x, v)
+        times, ok = scenario.frame_times, ok[jnp.ceil(places).astype(int)]
+    failed_at = motion.failed_at - before
+    return Solution(x, v, times, motion.final_state, ok, motion.result, failed_at)
+
+
+def at_frames(
+    scenario: Scenario,
+    x: Float[Array, "simulated vertex 3"],
+    v: Float[Array, "simulated vertex 3"],
+    delay: Float[Array, ""] | float = 0.0,
+) -> tuple[Float[Array, "frame vertex 3"], Float[Array, "frame vertex 3"]]:
+    """Positions [m] and velocities [m/s] at the frames of a scenario, from those that were
+    simulated; or `delay` [s] before them."""
+    return between(x, v, scenario.places - delay / scenario.interval, scenario.interval)
 
 
 def stepped(

@@ -21,7 +21,7 @@ from r2s.mesh.surface import nearest, sample
 from r2s.recordings.cameras import Camera
 from r2s.recordings.recording import Recording, RecordingInfo, corner, make_recording
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
-from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
+from r2s.scenarios.scenario import Scenario, SheetSolver, at_frames, rollout
 from r2s.scenarios.standard import ALL_CORNERS, SIDE, Experiment
 from r2s.solvers.mpm.sheet import longest_edge
 from r2s.solvers.simulate import Solution
@@ -112,13 +112,14 @@ def record(
     measured: dict[str, Any] = {}
     if experiment.name == "stretching":
         balance = _energy_balance(scenario, fabric, max_step, made)
-        measured, x = _measured(experiment, scenario, balance, key), balance.x
+        x, _ = at_frames(scenario, balance.x, balance.v)
+        measured = _measured(experiment, scenario, balance, x, key)
     else:
         known = _rollout(scenario, fabric, max_step, made) if motion is None else motion
         x = known.x
-    if x.shape != (scenario.num_frames, *scenario.start.shape):
+    if x.shape != (len(scenario.places), *scenario.start.shape):
         raise ValueError(
-            f"expected a motion of {scenario.num_frames} frames and {len(scenario.start)} "
+            f"expected a motion of {len(scenario.places)} frames and {len(scenario.start)} "
             f"vertices, got {x.shape}"
         )
     if not np.isfinite(x).all():
@@ -165,7 +166,7 @@ def seen_of(
 
 
 def _measured(
-    experiment: Experiment, scenario: Scenario, balance: EnergyBalance, key: PRNGKeyArray
+    experiment: Experiment, scenario: Scenario, balance: EnergyBalance, x, key: PRNGKeyArray
 ) -> dict[str, Any]:
     """The force on the pulled clamp and the markers of a stretching, with their errors."""
     key_markers, key_force = jr.split(jr.fold_in(key, 1))
@@ -173,7 +174,7 @@ def _measured(
     return {
         "force": force + FORCE_NOISE * np.asarray(jr.normal(key_force, force.shape, float)),
         "force_times": experiment.times,
-        "markers": markers_of(balance.x, scenario, key_markers),
+        "markers": markers_of(x, scenario, key_markers),
     }
 
 

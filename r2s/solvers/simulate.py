@@ -130,7 +130,10 @@ def simulate(
     times = jnp.arange(1, len(x) + 1, dtype=x.dtype) * every * dt
     if save_at is not None:
         times = jnp.asarray(save_at, x.dtype)
-        x, v, unfailed = _at(times / dt, state, x, v, unfailed, dt)
+        start: Any = state
+        x, v = (jnp.concatenate([a[None], b]) for a, b in ((start.x, x), (start.v, v)))
+        x, v = between(x, v, times / dt, dt)
+        unfailed = unfailed[jnp.clip(jnp.ceil(times / dt).astype(int) - 1, 0)]
     ok = jnp.all(jnp.isfinite(x), axis=(1, 2)) & unfailed
     result, failed_at = _first(failures.ravel(), dt)
     return Solution(x, v, times, end, ok, result, failed_at)
@@ -201,18 +204,22 @@ def _check_times(save_every: int | None, times: Any, steps: int, dt: Any) -> Non
         )
 
 
-def _at(places: Array, state: Any, x: Array, v: Array, unfailed: Array, dt: Any):
-    """Positions, velocities and whether nothing failed at `places`, counted in steps: the cubic
-    by both ends of a step (Hermite)."""
-    count = len(x)
-    x, v = (jnp.concatenate([a[None], b]) for a, b in ((state.x, x), (state.v, v)))
-    step = jnp.clip(places.astype(int), 0, count - 1)
+def between(
+    x: Float[Array, "save vertex axis"],
+    v: Float[Array, "save vertex axis"],
+    places: Float[Array, " place"],
+    dt: Float[Array, ""] | float,
+) -> tuple[Float[Array, "place vertex axis"], Float[Array, "place vertex axis"]]:
+    """Positions and velocities at `places` between saved ones, which are `dt` apart: the cubic by
+    both ends (Hermite). Places count saves from 0; what lies beyond the ends is taken as there."""
+    places = jnp.clip(places, 0, len(x) - 1)
+    step = jnp.clip(jax.lax.stop_gradient(places).astype(int), 0, len(x) - 2)
     s = (places - step).astype(x.dtype)[:, None, None]
     (x0, x1), (v0, v1) = (x[step], x[step + 1]), (v[step] * dt, v[step + 1] * dt)
     over = x1 - x0
     at = x0 + s * (v0 + s * (3 * over - 2 * v0 - v1 + s * (v0 + v1 - 2 * over)))
     rate = v0 + s * (2 * (3 * over - 2 * v0 - v1) + 3 * s * (v0 + v1 - 2 * over))
-    return at, rate / dt, unfailed[step]
+    return at, rate / dt
 
 
 def _first(failures: Int[Array, " step"], dt: Array) -> tuple[Array, Array]:

@@ -186,7 +186,8 @@ class Page:
             event.client.add_notification(title, text)
 
     def _run(self) -> None:
-        interval = self.subject.scenario.interval
+        scenario = self.subject.scenario
+        interval = scenario.interval * float(np.diff(np.asarray(scenario.places)).mean())
         due = time.monotonic()
         while not self._stop.is_set():
             if self._changed.is_set():

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from r2s.recordings.clouds import READERS, find_numbered, read_cloud
+from r2s.recordings.clouds import read_cloud
 
 POINTS = arrays(
     np.float32,
@@ -141,32 +141,3 @@ def test_a_missing_library_names_the_extra(
     monkeypatch.setitem(sys.modules, library, None)  # makes the import fail
     with pytest.raises(ImportError, match=rf"pip install 'r2s\[{extra}\]'"):
         read_cloud(tmp_path / f"a.{suffix}")
-
-
-def touch(folder: Path, *names: str) -> None:
-    for name in names:
-        (folder / name).touch()
-
-
-def test_frames_are_sorted_by_number(tmp_path: Path) -> None:
-    touch(tmp_path, "t1_frame_10.ply", "t1_frame_8.ply", "t1_frame_9.ply", "notes.txt", "mesh.obj")
-    touch(tmp_path, "._t1_frame_11.ply")
-    frames = find_numbered(tmp_path, READERS)
-    assert list(frames) == [8, 9, 10] and frames[8] == tmp_path / "t1_frame_8.ply"
-    with pytest.raises(ValueError, match="frame 0 is missing"):
-        find_numbered(tmp_path, READERS, first=0)
-    with pytest.raises(ValueError, match="frame 8 comes before the first frame, 9"):
-        find_numbered(tmp_path, READERS, first=9)
-
-
-def test_bad_folders_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
-        find_numbered(tmp_path / "nowhere", READERS)
-    with pytest.raises(FileNotFoundError, match="no numbered frames"):
-        find_numbered(tmp_path, READERS)
-    touch(tmp_path, "000.npy", "001.ply")
-    with pytest.raises(ValueError, match=r"mixed formats: \.npy, \.ply"):
-        find_numbered(tmp_path, READERS)
-    touch(tmp_path, "00.npy")
-    with pytest.raises(ValueError, match="frame 0 is there twice: 00.npy and 000.npy"):
-        find_numbered(tmp_path, READERS)

@@ -16,7 +16,7 @@ from r2s.materials import presets
 from r2s.recordings.clouds import Cleaning, clean, inside, outliers
 from r2s.recordings.images import read_mask
 from r2s.recordings.recording import cloud
-from r2s.recordings.rgbd import Rig, pair, read_clouds, read_rig, read_times, rgbd_recording, stream
+from r2s.recordings.rgbd import Rig, pair, read_clouds, read_rig, rgbd_recording, stream
 from r2s.recordings.synthetic_rgbd import NONE, write_rgbd
 from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import from_recording, rollout
@@ -94,22 +94,23 @@ def test_a_mask_may_have_a_palette(folder: Path, tmp_path: Path) -> None:
     shift=st.floats(-0.004, 0.004),
     starts_late=st.booleans(),
 )
-def test_pairs_are_within_the_tolerance(gaps, shift: float, starts_late: bool) -> None:
+def test_frames_within_the_tolerance_are_one_and_others_stand_alone(gaps, shift, starts_late):
     clock = np.cumsum(gaps)
     other = clock[int(starts_late) :] + shift
-    pairs = pair({"a": clock, "b": other}, 0.005)
-    apart = np.abs(clock[pairs["a"]] - other[pairs["b"]])
-    assert (apart <= 0.005).all()
-    assert len(pairs["a"]) == len(pairs["b"]) >= len(other) - 1
+    times = {"a": clock, "b": other}
+    frames = pair(times, 0.005)
+    assert np.all(np.diff([time for time, _ in frames]) > 0)
+    for time, chosen in frames:
+        assert all(abs(times[name][index] - time) <= 0.005 for name, index in chosen.items())
+    for name, ticks in times.items():  # every frame is there, once
+        assert [chosen[name] for _, chosen in frames if name in chosen] == list(range(len(ticks)))
+    assert sum(len(chosen) == 2 for _, chosen in frames) == len(other)
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["frame,time\n0,0.1\n1,0.2\n", "0.1\n0.2\n", "\ufeffTime [s]\r\n0.1\r\n\r\n0.2\r\n"],
-)
-def test_times_may_have_titles_and_frame_numbers(tmp_path: Path, text: str) -> None:
-    (tmp_path / "times.csv").write_text(text, encoding="utf-8")
-    np.testing.assert_allclose(read_times(tmp_path / "times.csv"), [0.1, 0.2])
+def test_cameras_out_of_phase_and_of_different_rates_keep_their_times():
+    frames = pair({"a": np.arange(4) / 10, "b": 0.02 + np.arange(7) / 20})
+    assert len(frames) == 11 and all(len(chosen) == 1 for _, chosen in frames)
+    np.testing.assert_allclose([time for time, _ in frames][:4], [0, 0.02, 0.07, 0.1])
 
 
 def test_cameras_of_a_set_lie_above_its_recordings(tmp_path: Path) -> None:

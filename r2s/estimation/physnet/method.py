@@ -39,7 +39,7 @@ from r2s.materials.parameters import ParameterSpace
 from r2s.recordings.recording import Recording
 from r2s.scenarios.energy import clamp_force, energy_balance
 from r2s.scenarios.resolution import mpm_cloth
-from r2s.scenarios.scenario import Scenario, SheetSolver, from_recording, rollout
+from r2s.scenarios.scenario import Scenario, SheetSolver, at_frames, from_recording, rollout
 from r2s.scenarios.standard import SCENARIOS
 
 Images = Float[np.ndarray, "frame down across"]
@@ -167,12 +167,13 @@ def answers(
         fabric, force = observation.space(place), []
         if (pull := observation.pull) is None:
             motion = rollout(scenario, fabric, solver=observation.solver)
-            ok = jnp.all(motion.ok)
+            x, ok = motion.x, jnp.all(motion.ok)
         else:
             motion = energy_balance(scenario, fabric, solver=observation.solver)
             ok = jnp.all(jnp.isfinite(motion.x)) & jnp.all(jnp.isfinite(motion.last))
+            x, _ = at_frames(scenario, motion.x, motion.v)
             force = [pull.coordinate(clamp_force(scenario, motion)[frames] @ pull.direction)]
-        x, faces = motion.x[frames], scenario.scene.mesh.faces
+        x, faces = x[frames], scenario.scene.mesh.faces
         depth = depths_of_sheet(observation.view, x, faces, observation.per_face)
         images = jax.vmap(partial(grey, observation.view))(depth)
         points = jnp.concatenate([jax.vmap(observation.network)(images), *force], axis=1)

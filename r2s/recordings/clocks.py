@@ -1,0 +1,146 @@
+"""When frames were taken: by a file of times, stamps or numbers in the names of their files."""
+
+import re
+import warnings
+from collections.abc import Collection
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from r2s.recordings.clouds import list_frames
+from r2s.recordings.force_log import check_increasing, number_in, read_lines
+
+LONGEST = 5.0  # [s] between frames: above, times are taken for milliseconds or nanoseconds
+EPOCH = 1e6  # [s]: later times count from 1970, or from when a machine was started
+DIGITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}  # of stamps that are whole numbers, and their unit [s]
+SECONDS = re.compile(r"(?:^|[^0-9A-Za-z.])(\d+)\.(\d+)$")  # as in 1700000100.001234567
+PARTED = re.compile(r"(?:^|\D)(\d{9,10})[_-](\d{9}|\d{6})$")  # as in 1700000100_001234567
+WHOLE = re.compile(r"(?:^|\D)(\d{13}|\d{16}|\d{19})$")
+
+
+class Frames(NamedTuple):
+    """The files of frames in the order of time.
+
+    - `keys`: the number or the time [s] in each name.
+    - `numbers`: those in the names less that of the first frame; of stamped files from 0 on.
+    - `stamps`: the times in their names, [s]; None: they have numbers.
+    """
+
+    files: list[Path]
+    keys: list[float]
+    numbers: list[int]
+    stamps: Float[np.ndarray, " frame"] | None
+
+
+def find_frames(folder: Path | str, suffixes: Collection[str], first: int | None = None) -> Frames:
+    """The frames of a folder, by the numbers or the times in their names (`000.npy`,
+    `frame_12.npy`, `1700000100.001234567.pcd`, `1700000100001234567.npy`).
+
+    Files without one of the `suffixes` or a number are skipped; numbers may be missing. `first`:
+    the number of the frame at time 0; None: the least there is. Raises FileNotFoundError, or
+    ValueError that names the folder and the frame.
+    """
+    files = list_frames(folder, suffixes)
+    stamps = _stamps(Path(folder), files)
+    if stamps is not None:
+        order = np.argsort(stamps, kind="stable")
+        ordered = [files[i] for i in order]
+        for at in np.flatnonzero(np.diff(stamps[order]) == 0)[:1]:
+            names = f"{ordered[at].name} and {ordered[at + 1].name}"
+            raise ValueError(f"{folder}: {names} have the same time: which of them is the frame?")
+        return Frames(ordered, stamps[order].tolist(), list(range(len(files))), stamps[order])
+    frames: dict[float, Path] = {}
+    for path in files:
+        number = int(re.findall(r"[0-9]+", path.stem)[-1])
+        other = frames.setdefault(number, path)
+        if other != path:
+            raise ValueError(
+                f"{folder}: frame {number} is there twice: {other.name} and {path.name}: keep one, "
+                "or, if the names are times, write these to times.csv, a line a frame"
+            )
+    keys = sorted(frames)
+    start = keys[0] if first is None else first
+    if keys[0] < start:
+        raise ValueError(f"{folder}: frame {keys[0]} comes before the first frame, {start}")
+    return Frames([frames[key] for key in keys], keys, [int(key - start) for key in keys], None)
+
+
+def times_of(
+    folder: Path, frames: Frames, rate: float, table: Path | None = None
+) -> Float[np.ndarray, " frame"]:
+    """The times [s] of frames: those of a file, else the stamps in their names, else their numbers
+    over a rate [Hz], with a warning where numbers are missing.
+
+    `table`: a CSV as for `read_times`; None: times.csv in the folder, where there is one.
+    """
+    path = table or folder / "times.csv"
+    if table is not None or path.is_file():
+        times = read_times(path)
+        if len(times) != len(frames.files):
+            raise ValueError(
+                f"{path}: {len(times)} times, but {len(frames.files)} frames in {folder}: "
+                "one line a frame"
+            )
+        return times
+    if frames.stamps is not None:
+        return frames.stamps
+    if not rate > 0:
+        raise FileNotFoundError(
+            f"{path}: no such file, no times in the names of the frames, and no frame_rate: give "
+            "one of them"
+        )
+    expected = range(frames.numbers[-1] + 1)
+    if missing := sorted(set(expected) - set(frames.numbers)):
+        words = ", ".join(map(str, missing[:8])) + ", ..." * (len(missing) > 8)
+        warnings.warn(
+            f"{folder}: {len(missing)} of {len(expected)} frames are missing ({words}, counted from"
+            " the first): the others are taken at their numbers over the frame rate",
+            stacklevel=2,
+        )
+    return np.array(frames.numbers) / rate
+
+
+def read_times(path: Path) -> Float[np.ndarray, " frame"]:
+    """The frames' times [s] from the last column of a CSV file; a line of titles may come first.
+
+    Raises FileNotFoundError, or ValueError that names the file and the line.
+    """
+    rows = read_lines(path)
+    if rows and re.match("[A-Za-z]", rows[0][1][-1]):
+        rows = rows[1:]
+    times = np.array([number_in(path, line, cells[-1], "a time [s] last") for line, cells in rows])
+    if len(times) == 0:
+        raise ValueError(f"{path}: no times: expected one line a frame, its time [s] last")
+    check_increasing(path, [line for line, _ in rows], times)
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    if interval > LONGEST:
+        raise ValueError(
+            f"{path}: frames are {interval:g} s apart: give times in seconds, not in milliseconds "
+            "or nanoseconds"
+        )
+    return times
+
+
+def _stamps(folder: Path, files: list[Path]) -> Float[np.ndarray, " frame"] | None:
+    """The times in the names of all files, [s]; None where they are numbers."""
+    stems = [path.stem for path in files]
+    if all(whole := [WHOLE.search(stem) for stem in stems]):
+        return np.array([int(m[1]) * DIGITS[len(m[1])] for m in whole if m])
+    if all(parted := [PARTED.search(stem) for stem in stems]):
+        return np.array([int(m[1]) + float(f"0.{m[2]}") for m in parted if m])
+    if not all(pairs := [SECONDS.search(stem) for stem in stems]):
+        return None
+    seconds, fractions = zip(*((m[1], m[2]) for m in pairs if m), strict=True)
+    widths = {len(fraction) for fraction in fractions}
+    if len(widths) > 1 and int(seconds[0]) > EPOCH:
+        raise ValueError(
+            f"{folder}: the names are times whose fractions have {min(widths)} to {max(widths)} "
+            "digits: decimals, or nanoseconds without their zeros? Write times.csv there, the time "
+            "[s] of each frame on a line"
+        )
+    last = np.array([int(fraction) for fraction in fractions])
+    if len(set(seconds)) == 1 and min(widths) >= 4 and np.all(np.diff(np.sort(last)) == 1):
+        return None  # a version, and the number of a frame
+    return np.array([float(f"{a}.{b}") for a, b in zip(seconds, fractions, strict=True)])
