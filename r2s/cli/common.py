@@ -74,6 +74,8 @@ def load_card(text: str) -> "Card":
         raise ValueError(
             f"{text}: no such card, and no preset; they are {', '.join(presets.MEASURED)}"
         )
+    if Path(text).suffix.lower() == ".npz" or Path(text).is_dir():
+        raise ValueError(f"{text}: this is a recording; a card (JSON) or a preset comes first")
     return cards.read(text)
 
 

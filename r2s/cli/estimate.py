@@ -64,8 +64,8 @@ class EstimateCard:
     solver: Literal["cloth", "mpm"] | None = None
     """What simulates: the cloth (orthotropic fabrics) or material points (isotropic ones); by
     default what the method supports."""
-    law: Literal["linear", "stiffening", "softening", "stiffening+softening"] | None = None
-    """Constant stiffness; stiffening: yarns whose stiffness grows with their stretch (three numbers
+    law: Annotated[str | None, arg(metavar="LAW")] = None
+    """linear: constant; stiffening: yarns whose stiffness grows with their stretch (three numbers
     more); softening: bending whose stiffness falls with the curvature (two more). By default both
     for diffcloud where the force of a pull was recorded and another motion, and no laboratory test
     is given; else constant."""
@@ -124,7 +124,7 @@ class EstimateCard:
         forget(self._progress_file)
         if self.plot is not None:
             _draw(self.plot, outcome)
-        lines = [*report(outcome), f"{self.out}: {card.name}"]
+        lines = [*report(outcome), f"wrote {self.out}, the card of {card.name}"]
         print_result(self.json, cards.as_json(card), lines)
         return 0
 

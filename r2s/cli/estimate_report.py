@@ -153,7 +153,9 @@ def unread(method: Method, recordings: Sequence[Recording]) -> Iterator[str]:
         left = [kind for kind, is_left in kinds.items() if is_left]
         most = int(each.mask.sum(axis=1).max())
         if has_clouds and reads.points and reads.points < most:
-            left.append(f"all but {reads.points} points a frame, drawn at random, of up to {most}")
+            left.append(
+                f"points beyond {reads.points} a frame, drawn at random (up to {most} are there)"
+            )
         first, last = each.info.frames_used
         if len(reads.frames) < last - first + 1:
             left.append(f"{last - first + 1 - len(reads.frames)} of {last - first + 1} frames")

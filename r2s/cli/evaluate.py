@@ -13,15 +13,7 @@ if TYPE_CHECKING:
     from r2s.estimation.cards import Card
     from r2s.recordings.recording import Recording
 
-DISTANCE = "chamfer_real_to_sim"
-EXPLAINED = {
-    DISTANCE: "mean distance from a recorded point to the simulated sheet",
-    "chamfer_sim_to_real": "the reverse: large where cameras do not see the sheet",
-    "chamfer": "the mean of both",
-    "hausdorff": "the largest distance: that of one outlier, or of a part that no camera sees",
-    "paper_chamfer": "of the study: sum of mean squares, each cloud scaled by its first frame",
-    "paper_hausdorff": "of the study: the largest distance, scaled likewise",
-}
+DISTANCE = "surface"
 CROPPED = "; without the simulated sheet below the lowest recorded point"
 
 
@@ -29,7 +21,7 @@ CROPPED = "; without the simulated sheet below the lowest recorded point"
 class Evaluate:
     """Measure how well a fabric predicts recorded motions.
 
-    Prints the mean distance of the recorded points from the simulated sheet, over the frames that
+    Prints the mean distance of all recorded points from the simulated surface, over the frames that
     count; beside it the same distance for the prior mean (the fabric that one would guess from the
     weight alone), and what the noise of the points and the simulated mesh allow.
 
@@ -76,6 +68,8 @@ class Evaluate:
         return 1 if failures else 0
 
     def _judge(self, card: "Card", recording: "Recording", is_last: bool) -> "Judged":
+        import numpy as np
+
         from r2s.cli.common import choose_shape
         from r2s.estimation.cards import fingerprint
         from r2s.estimation.held_out import in_steps
@@ -87,16 +81,20 @@ class Evaluate:
         shape, mesh, words = choose_shape(self.shape, fabric, info.sheet.size, info.scenario)
         scenario = in_steps(recording, shape)
         motion = prediction_error.predict_motion(scenario, fabric)
-        metrics = prediction_error.against_motion(recording, motion.x, shape=shape)
         guess = prediction_error.predict_motion(scenario, prior.middle(float(fabric.density)))
-        guessed = prediction_error.against_motion(recording, guess.x, shape=shape)
+        surface, guessed = (
+            float(np.mean(prediction_error.from_surface(recording, x, shape)))
+            for x in (motion.x, guess.x)
+        )
+        metrics = {DISTANCE: surface}
+        metrics |= prediction_error.against_motion(recording, motion.x, shape=shape)
         if self.plot is not None and is_last:
             self._draw(self.plot, recording, scenario.scene.mesh.faces, motion.x, guess.x)
         failed = math.isnan(metrics[DISTANCE])
         own = fingerprint(recording) in {digest for _, digest in card.provenance.recordings}
         noise = mean_distance(point_noise(recording))
         why = str(motion.failure) if failed else ""
-        return Judged(metrics, guessed[DISTANCE], noise, mesh, words, why, own)
+        return Judged(metrics, guessed, noise, mesh, words, why, own)
 
     def _draw(self, path: Path, recording: "Recording", faces, x, guess) -> None:
         from r2s.recordings.open import SimulatedCloth
@@ -127,6 +125,7 @@ class Judged(NamedTuple):
     def lines(self, name: str, with_all: bool) -> list[str]:
         """For people."""
         from r2s._util.units import millimetres
+        from r2s.metrics.prediction_error import METRICS
 
         if self.failure:
             return [f"{name}: the simulation {self.failure}"]
@@ -144,7 +143,7 @@ class Judged(NamedTuple):
         if with_all:
             for metric, value in self.metrics.items():
                 text = f"{value:.4f}" if metric.startswith("paper_") else millimetres(value)
-                words = EXPLAINED.get(metric.removesuffix("_cropped"), "")
+                _, words = METRICS[metric.removesuffix("_cropped")]
                 words += CROPPED * metric.endswith("_cropped")
                 lines.append(f"    {metric:29s}{text:>10s}  {words}")
         return lines

@@ -33,7 +33,7 @@ class Waiting:
         self._rewrite()
 
     def __call__(self, iteration: int, loss: float) -> None:
-        self._numbers = f", iteration {iteration}, root of loss {loss**0.5:.3g}"
+        self._numbers = f", iteration {iteration}, root of loss {1e3 * loss**0.5:.3g} mm"
         self._rewrite()
 
     def __enter__(self) -> "Waiting":

@@ -109,7 +109,7 @@ class Scene(eqx.Module):
             )
 
     def check_vertices(self, **arrays: Array | None) -> None:
-        """Raise `ValueError` for an array that has not three numbers for each vertex."""
+        """Raise `ValueError` for an array that has not three finite numbers for each vertex."""
         expected = (self.mesh.rest.shape[0], 3)
         for name, array in arrays.items():
             if array is not None and array.shape != expected:
@@ -117,6 +117,10 @@ class Scene(eqx.Module):
                     f"{name} must be {expected}, a place or velocity of each vertex of the mesh; "
                     f"got {array.shape}"
                 )
+            if array is not None and not is_traced(array):
+                bad = ~np.isfinite(np.asarray(array)).all(axis=1)
+                if bad.any():
+                    raise ValueError(f"{name} of vertex {int(bad.argmax())} is not finite")
 
     def place(
         self, x: Float[Array, "vertex 3"], pinned: Float[Array, "pinned 3"]

@@ -6,23 +6,20 @@ and the value of a parameter that a motion does not determine.
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from r2s.materials import prior
 from r2s.materials.parameters import (
+    EXTENDED,
     LOSSES,
-    SOFTENING,
     IsotropicSpace,
     OrthotropicSpace,
     ParameterSpace,
     Range,
-    SofteningSpace,
-    StiffeningSpace,
-    stiffens,
 )
 from r2s.recordings.recording import Recording
 
-Law = Literal["linear", "stiffening", "softening", "stiffening+softening"]
+Law = str  # "linear", or names of `EXTENDED` with + between them
 
 RANGES = (
     Range("warp", "N/m", 6.0, 20000.0),
@@ -47,15 +44,21 @@ FROM = {
     "knee weft": "from 0.3 % to none that is reached",
     "E h": "around 100 N/m, where the public code of DiffCP starts; longer would be shorter steps",
     "nu": "isotropic solids, 0 to 0.5",
+    **{name: words for space in EXTENDED.values() for name, words in space.origins.items()},
 }
 """Of each range: what it is around. The prior is `r2s.materials.prior`."""
 
 
 def with_law(space: ParameterSpace, law: Law) -> ParameterSpace:
-    """A space of constant stiffness, with yarns that stiffen and bending that softens as asked."""
-    if "softening" in law:
-        space = SofteningSpace.make(space)
-    return StiffeningSpace.make(space) if "stiffening" in law else space
+    """A space of constant stiffness, with the numbers of a law besides. Raises `ValueError` for one
+    that is not known."""
+    names = [] if law == "linear" else law.split("+")
+    if unknown := [name for name in names if name not in EXTENDED]:
+        known = ", ".join(("linear", *EXTENDED))
+        raise ValueError(f"no law {unknown[0]!r}; there are {known}, and several with +")
+    for name in reversed(EXTENDED):
+        space = EXTENDED[name].make(space) if name in names else space
+    return space
 
 
 def identified_law(recordings: Sequence[Recording]) -> Law:
@@ -69,10 +72,9 @@ def identified_law(recordings: Sequence[Recording]) -> Law:
 
 def law_of(ranges: Sequence[Range]) -> Law:
     """The law of a space's parameters, or of an estimate's, by their names."""
-    softens = SOFTENING[0].name in {bound.name for bound in ranges}
-    if stiffens(ranges):
-        return "stiffening+softening" if softens else "stiffening"
-    return "softening" if softens else "linear"
+    names = {bound.name for bound in ranges}
+    laws = [law for law, space in EXTENDED.items() if space.extra[0].name in names]
+    return "+".join(laws) or "linear"
 
 
 class Fixed(NamedTuple):

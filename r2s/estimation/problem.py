@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
+from r2s._util.checks import check_kinds
 from r2s.estimation.method import DataRequirements, frames_that_count
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
@@ -192,6 +193,11 @@ class Problem(eqx.Module):
         Raises `ValueError` when a marker is not seen in the first frame, or lies off the sheet
         there.
         """
+        call = "Problem.make(recording, space)"
+        check_kinds(call, recording=(recording, Recording), space=(space, ParameterSpace))
+        scales = (nuisance_prior or USUAL).scales
+        if not all(math.isfinite(scale) and scale >= 0 for scale in scales):
+            raise ValueError(f"standard deviations must not be negative, found {nuisance_prior}")
         scenario = from_recording(recording, shape)
         first, last = recording.info.frames_used
         frames = slice(first, last + 1)

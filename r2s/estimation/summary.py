@@ -11,10 +11,10 @@ from r2s.estimation.estimate import Estimate, Fit, Nuisance
 HEADER = ("parameter", "estimate", "90 % interval", "posterior/prior")
 NEXT = {  # a recording, and the parameters that it determines best
     "three stretchings with their force, along warp and weft and at 45 degrees": (
-        *("warp", "weft", "shear", "coupling", "stiffening", "knee warp", "knee weft"),
+        *("warp", "weft", "shear", "coupling", "stiffening", "knee"),
         *("E h", "nu"),
     ),
-    "a lift of one corner, or a cantilever test": ("bending", "bending loss", "bending knee"),
+    "a lift of one corner, or a cantilever test": ("bending",),
     "a fling or a swing of the hanging sheet": ("damping",),
     "a fold or a drag over the table": ("friction",),
 }
@@ -36,7 +36,8 @@ def describe(estimate: Estimate) -> list[str]:
         lines.append(f"discretization error{mesh}, part of the intervals: {parts}")
     lines += [_fit(fit, mesh) for fit in estimate.fits]
     if estimate.nuisances:
-        lines.append(f"nuisance parameters: {', '.join(map(_nuisance, estimate.nuisances))}")
+        parts = ", ".join(map(_nuisance, estimate.nuisances))
+        lines.append(f"nuisance parameters (+- standard error): {parts}")
     lines += _search(estimate, mesh)
     named = ", ".join(f"{name} ({side})" for name, side in estimate.at_bounds.items())
     if named:
@@ -49,16 +50,24 @@ def next_recording(estimate: Estimate) -> list[str]:
     to the prior's; none without standard errors."""
     ratios = zip((bound.name for bound in estimate.ranges), estimate.narrowing, strict=True)
     known = {name: float(ratio) for name, ratio in ratios if np.isfinite(ratio)}
-    kinds = {kind: [name for name in names if name in known] for kind, names in NEXT.items()}
+    kinds = {
+        kind: [name for name in known if name in names or name.split()[0] in names]
+        for kind, names in NEXT.items()
+    }
     kinds = {kind: names for kind, names in kinds.items() if names}
     if not kinds:
         return []
     order = sorted(kinds, key=lambda kind: -sum(known[name] ** 2 for name in kinds[kind]))
-    named = (
-        f"{kind}, for {', '.join(f'{name} ({known[name]:.2g})' for name in kinds[kind])}"
-        for kind in order[:2]
+    named = (f"{kind}, for {_worst(kinds[kind], known)}" for kind in order[:2])
+    return [f"record next: {'; then '.join(named)} (in brackets posterior/prior)"]
+
+
+def _worst(names: list[str], known: dict[str, float]) -> str:
+    """Parameters whose ratio is at least half of the largest, that first."""
+    names = sorted(names, key=lambda name: -known[name])
+    return ", ".join(
+        f"{name} ({known[name]:.2g})" for name in names if known[name] >= known[names[0]] / 2
     )
-    return [f"record next: {'; then '.join(named)}"]
 
 
 def _table(estimate: Estimate) -> list[str]:
@@ -68,16 +77,22 @@ def _table(estimate: Estimate) -> list[str]:
         unit = "" if bound.unit == "-" else f" {bound.unit}"
         side = estimate.at_bounds.get(bound.name)
         end = f"  (at its {side} bound)" if side else ""
-        interval = f"{low:.3g} to {high:.3g}{unit}" if np.isfinite(low) else "unknown"
+        ends = _end(low, bound.low), _end(high, bound.high)
+        interval = f"{ends[0]} to {ends[1]}{unit}" if np.isfinite(low) else "unknown"
         rows.append((bound.name, f"{value:.4g}{unit}", interval, f"{ratio:.2g}{end}"))
     last = (
         "posterior/prior: how far the recording narrowed what was known (standard deviations; "
-        "1: not at all)"
+        "1: not at all); *: the end of the range that is searched"
     )
     if not np.isfinite(estimate.standard_errors).any():
         rows, last = [row[:2] for row in rows], "this method gives no standard errors"
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [*("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows), last]
+
+
+def _end(value: float, limit: float) -> str:
+    """The end of an interval, marked where it is that of the range."""
+    return f"{value:.3g}" + "*" * bool(np.isclose(value, limit, rtol=1e-3))
 
 
 def _fit(fit: Fit, mesh: str) -> str:
@@ -86,7 +101,7 @@ def _fit(fit: Fit, mesh: str) -> str:
     if np.isfinite(fit.noise):
         words.append(f"the noise of its points allows {millimetres(fit.noise)}")
     if np.isfinite(fit.mesh):
-        words.append(f"a prediction{mesh} is expected to be {millimetres(fit.mesh)} off")
+        words.append(f"a prediction{mesh} is expected to be {millimetres(fit.mesh)} off a fine one")
     return "; ".join(words)
 
 

@@ -105,10 +105,14 @@ def check_fabric(fabric: Any, may_lack: bool = False) -> None:
         if not least >= 0 or (must_be_positive and least == 0):
             word = "positive" if must_be_positive else "not negative"
             raise ValueError(f"fabric: {name} must be {word} [{unit}], found {least}")
-    heaviest = float(np.max(np.asarray(fabric.density)))
-    if heaviest > HEAVIEST:
-        grams = f"{heaviest / 1e3:g} if that is in g/m^2"
-        raise ValueError(f"fabric: density must be in kg/m^2, found {heaviest:g}: {grams}")
+    check_density(float(np.max(np.asarray(fabric.density))))
+
+
+def check_density(density: float) -> None:
+    """Raise `ValueError` for an areal density [kg/m^2] that must have been meant in g/m^2."""
+    if density > HEAVIEST:
+        grams = f"{density / 1e3:g} if that is in g/m^2"
+        raise ValueError(f"density must be in kg/m^2, found {density:g}: {grams}")
 
 
 def constant_laws(fabric: Fabric) -> tuple[OrthotropicMembrane, PlateBending]:

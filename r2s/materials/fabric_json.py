@@ -14,15 +14,17 @@ import numpy as np
 from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import NUMBERS, Fabric, check_fabric
 from r2s.materials.membrane import OrthotropicMembrane, SpringMembrane
-from r2s.materials.plate import OrthotropicPlate, PlateBending
-from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
+from r2s.materials.parameters import EXTENDED
+from r2s.materials.plate import OrthotropicPlate, PlateBending, PlateLaw
 from r2s.materials.tables import TableBending, TableMembrane
 
-MEMBRANES = OrthotropicMembrane, StiffeningMembrane, SpringMembrane, TableMembrane
-BENDINGS = PlateBending, OrthotropicPlate, SofteningPlate, HingeBending, TableBending
+KINDS = [space.kind for space in EXTENDED.values()]  # which estimates may have
+PLATES = [kind for kind in KINDS if issubclass(kind, PlateLaw)]
+YARNS = [kind for kind in KINDS if kind not in PLATES]
+MEMBRANES = OrthotropicMembrane, *YARNS, SpringMembrane, TableMembrane
+BENDINGS = PlateBending, OrthotropicPlate, *PLATES, HingeBending, TableBending
 LAWS = {"membrane": (MEMBRANES, "N/m"), "bending": (BENDINGS, "N m")}
 TABLE_SHAPES = {TableMembrane: (6, 4), TableBending: (3, 5)}
-DIMENSIONLESS = "poissons_ratio", "ratio", "loss", "knee_weft"
 
 
 def fabric_as_json(fabric: Fabric) -> dict[str, Any]:
@@ -107,9 +109,7 @@ def _fields(law: type) -> dict[str, bool]:
 
 
 def _unit(part: str, law: type, name: str) -> str:
-    if name == "knee":
-        return "-" if law is StiffeningMembrane else "1/m"
-    return "-" if name in DIMENSIONLESS else LAWS[part][1]
+    return getattr(law, "units", {}).get(name, LAWS[part][1])
 
 
 def _law_from(stored: Any, part: str, where: str) -> Any:

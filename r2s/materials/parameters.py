@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s._util.units import not_negative, positive
-from r2s.materials.fabric import Fabric, constant_laws
+from r2s.materials.fabric import Fabric, check_density, constant_laws
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import PlateBending
 from r2s.materials.stiffening import HALF, SofteningPlate, StiffeningMembrane
@@ -115,12 +115,16 @@ class ExtendedSpace(ParameterSpace):
     """The fabrics of another space, whose laws have some numbers more.
 
     - `space`: the other one, of constant stiffness.
-    - `extra`: ranges of the numbers that this one adds.
+    - `extra`: ranges of the numbers that this one adds. `kind`: the law that has them, and
+      `name` in a list of laws. `FROM` of `r2s.estimation.default_spaces` is theirs, too.
     """
 
     space: ParameterSpace
     ranges: tuple[Range, ...] = eqx.field(static=True)
     extra: ClassVar[tuple[Range, ...]]
+    kind: ClassVar[type]
+    name: ClassVar[str]
+    origins: ClassVar[dict[str, str]] = {}
 
     @classmethod
     def make(cls, space: ParameterSpace) -> "ExtendedSpace":
@@ -184,6 +188,7 @@ class OrthotropicSpace(ParameterSpace):
     def make(cls, density: float, thickness: float = 1e-3) -> "OrthotropicSpace":
         """The space of an areal density [kg/m^2] and a thickness [m], which must be positive."""
         positive("kg/m^2", density=density)
+        check_density(density)
         positive("m", thickness=thickness)
         return cls(density=jnp.asarray(density, float), thickness=jnp.asarray(thickness, float))
 
@@ -237,6 +242,7 @@ class IsotropicSpace(ParameterSpace):
         `losses`: `LOSSES` makes damping and friction parameters.
         """
         positive("kg/m^2", density=density)
+        check_density(density)
         positive("m", plate=plate, thickness=thickness)
         not_negative("s", damping=damping)
         not_negative("-", friction=friction)
@@ -293,6 +299,8 @@ class StiffeningSpace(ExtendedSpace):
     """
 
     extra: ClassVar[tuple[Range, ...]] = STIFFENING
+    kind: ClassVar[type] = StiffeningMembrane
+    name: ClassVar[str] = "stiffening"
 
     def extended(self, fabric: Fabric, values: Float[Array, " extra"]) -> Fabric:
         """The fabric, stiffening."""
@@ -330,6 +338,8 @@ class SofteningSpace(ExtendedSpace):
     """
 
     extra: ClassVar[tuple[Range, ...]] = SOFTENING
+    kind: ClassVar[type] = SofteningPlate
+    name: ClassVar[str] = "softening"
 
     def extended(self, fabric: Fabric, values: Float[Array, " extra"]) -> Fabric:
         """The fabric, softening."""
@@ -342,6 +352,9 @@ class SofteningSpace(ExtendedSpace):
             return fabric, jnp.array([0.0, 0.5])
         small = replace(fabric, bending=law.small)
         return small, self.places(law.loss, law.knee)
+
+
+EXTENDED = {each.name: each for each in (StiffeningSpace, SofteningSpace)}  # by law
 
 
 class InformedSpace(ParameterSpace):

@@ -62,6 +62,7 @@ class PlateBending(PlateLaw):
 
     stiffness: Float[Array, "*batch"]
     poissons_ratio: Float[Array, "*batch"]
+    units: ClassVar[dict[str, str]] = {"poissons_ratio": "-"}
 
     @classmethod
     def make(cls, stiffness: Scalar, poissons_ratio: Scalar = 0.0) -> "PlateBending":

@@ -5,6 +5,8 @@ tables of it), and bend more easily once the friction between their yarns is ove
 here are assumed. They derive from an energy, so that the motion of such a sheet converges.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -31,6 +33,7 @@ class StiffeningMembrane(eqx.Module):
     ratio: Float[Array, "*batch"]
     knee: Float[Array, "*batch"]
     knee_weft: Float[Array, "*batch"]
+    units: ClassVar[dict[str, str]] = {"ratio": "-", "knee": "-", "knee_weft": "-"}
 
     @classmethod
     def make(
@@ -86,6 +89,7 @@ class SofteningPlate(PlateLaw):
     small: PlateBending
     loss: Float[Array, "*batch"]
     knee: Float[Array, "*batch"]
+    units: ClassVar[dict[str, str]] = {"loss": "-", "knee": "1/m"}
 
     def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a curvature (k11, k22, 2 k12) [1/m]."""

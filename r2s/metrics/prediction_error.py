@@ -22,7 +22,16 @@ from r2s.scenarios.scenario import Scenario, SheetSolver, from_recording, rollou
 Cloud = Float[np.ndarray, "_ 3"]
 
 ALL_SAMPLES = 9**2 * 128  # of a sheet's surface: about the study's 10,000, on any mesh
-UNITS = {"paper_chamfer": "-", "paper_hausdorff": "-"}  # all others are in metres
+METRICS = {  # of `from_surface`, `distances` and `paper_units`: unit, and what they are
+    "surface": ("m", "mean distance from a recorded point to the simulated surface"),
+    "chamfer_real_to_sim": ("m", "the same to the nearest of many points on it: some 2 mm more"),
+    "chamfer_sim_to_real": ("m", "the reverse: large where cameras do not see the sheet"),
+    "chamfer": ("m", "the mean of both"),
+    "hausdorff": ("m", "the largest distance: that of one outlier, or of a part no camera sees"),
+    "paper_chamfer": ("-", "of the study: sum of mean squares, each cloud scaled by its first"),
+    "paper_hausdorff": ("-", "of the study: the largest distance, scaled likewise"),
+}
+UNITS = {name: unit for name, (unit, _) in METRICS.items() if unit != "m"}
 FARTHEST, TURN = 0.03, 0.3  # [m] and [rad], of a placement: two deviations of an estimate's prior
 OUTLIER = 0.02  # [m], from where on distances pull less
 PLACED = 300  # points of a frame, from which a placement is fitted

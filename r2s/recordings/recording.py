@@ -41,6 +41,8 @@ class SheetPlacement:
     former: ClassVar[dict[str, str]] = {"held": "pinned"}  # names in files of before 0.4
 
     def __post_init__(self) -> None:
+        if np.shape(self.size) != (2,):
+            raise ValueError(f"sheet: size must be (warp, weft) [m], found {self.size}")
         if not all(np.isfinite(side) and side > 0 for side in self.size):
             raise ValueError(f"sheet: sides must be positive [m], found {self.size}")
         if not np.isfinite(self.origin).all():

@@ -29,6 +29,7 @@ NUM_FRAMES = 60
 INTERVAL, STRETCHING_INTERVAL = 1 / 15, 1 / 30  # [s]
 SWING_SIDE, SWING_FRAMES, SWING_INTERVAL = 0.3, 50, 0.1  # [m], -, [s]: those of public swings
 GRIP_HEIGHT = 0.7  # [m] above the table, of a hanging sheet's grippers
+FARTHEST = 20.0  # [m] from the origin, of grippers
 ALL_CORNERS = ("origin", "weft", "warp", "opposite")
 Size = tuple[float, float]
 
@@ -210,4 +211,6 @@ def _moved(
         raise ValueError(f"{name}: a route is given, which {', '.join(path)} would not change")
     times = np.arange(num_frames) * interval
     route = made(sheet, times[-1], **path) if route is None else route
+    if (far := float(np.abs(route.path).max())) > FARTHEST:
+        raise ValueError(f"{name}: the grippers go {far:g} m far: lengths are in metres")
     return Experiment(name, sheet, route, times, (0, num_frames - 1))

@@ -2,6 +2,6 @@
 
 - `plan`: the tasks of a study. `recordings`, `mujoco`: what they estimate from and evaluate on.
 - `estimates`, `evaluations`, `ensembles`: the tasks; `tasks` and `engine` run them.
-- `verdicts`, `results`: the results as one table, `results.csv`.
-- `statistics`: its analysis. `report`: tables, figures and motions on one page.
+- `results`: the results as one table, `results.csv`.
+- `comparisons`, `conclusions`: its analysis. `report`: tables, figures and motions on one page.
 """

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from r2s.materials import prior
 from r2s.materials.fabric import Fabric
 from r2s.metrics import prediction_error
-from r2s.metrics.prediction_error import Motion
+from r2s.metrics.prediction_error import METRICS, Motion
 from r2s.recordings.recording import Recording
 from r2s.scenarios.resolution import EDGE, MEMBRANE_DAMPING, explicit_cloth, grid_around
 from r2s.scenarios.scenario import Scenario, from_recording
@@ -56,7 +56,10 @@ class EvaluationTask(Task):
     """
 
     kind: ClassVar[str] = "evaluations"
-    settings: ClassVar[tuple[Any, ...]] = (SHAPES, MOST, IMPLICIT, RETRIES, LADDER, SETTLING)
+    settings: ClassVar[tuple[Any, ...]] = (
+        *(SHAPES, MOST, IMPLICIT, RETRIES, LADDER, SETTLING),
+        tuple(METRICS),
+    )
 
     estimate: EstimateTask | None
     solver: str

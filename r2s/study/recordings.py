@@ -425,9 +425,9 @@ def small_strain(name: str) -> Fabric:
 def true_fabric(name: str, law: Law, truth: TruthSettings = TruthSettings()) -> Fabric:
     """The fabric that a recording is made with in the laws of an estimate: stiffnesses that it has
     as constants are those at small strain."""
-    small, changing = small_strain(name), strain_dependent(name, truth)
+    small, changing, laws = small_strain(name), strain_dependent(name, truth), law.split("+")
     return dataclasses.replace(
         changing,
-        membrane=changing.membrane if "stiffening" in law else small.membrane,
-        bending=changing.bending if "softening" in law else small.bending,
+        membrane=changing.membrane if "stiffening" in laws else small.membrane,
+        bending=changing.bending if "softening" in laws else small.bending,
     )

@@ -16,6 +16,7 @@ import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
 from r2s._util.files import write_text
+from r2s.metrics.prediction_error import METRICS, UNITS
 from r2s.metrics.statistics import LEVEL
 from r2s.study import comparisons, conclusions
 from r2s.study import results as frame
@@ -39,7 +40,7 @@ from r2s.study.tasks import Task, provenance, result_files
 # The first that is there compares configurations: within the horizon, where one is known. The
 # parts of a sheet that cameras did not see do not count. Hausdorff distances are those of outliers.
 JUDGED_BY = (SURFACE, "chamfer_real_to_sim", "chamfer", "chamfer_cropped", conclusions.CHAMFER)
-DISTANCES = (*JUDGED_BY[:-1], "chamfer_sim_to_real", "hausdorff")
+DISTANCES = tuple(dict.fromkeys([*JUDGED_BY[:-1], *(m for m in METRICS if m not in UNITS)]))
 MOST_MOTIONS = 15  # that are drawn
 PRINTED = ("skill", "findings")  # the other tables are in files
 VERSIONS = ("r2s", "jax", "jaxlib", "equinox", "numpy", "scipy", "pandas", "statsmodels", "plotly")

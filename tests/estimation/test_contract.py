@@ -93,11 +93,11 @@ def test_a_method_keeps_the_contract_on_the_cloth(recording, name):
     seen = []
     found = ran(name, recording, SPACE, progress=lambda step, loss: seen.append(loss))
     assert found.approach.startswith(name) and np.isfinite(found.loss) and seen
-    # four frames in 0.3 s tell little beyond the prior: two steps arrive, 14 evaluations do not
-    assert found.converged is (name == "diffcloud")
-    assert from_json(as_json(found)).converged is found.converged
-    words = "converged" if found.converged else "not converged: the budget ended it"
-    assert any(line.startswith("search") and f": {words};" in line for line in describe(found))
+    # after two steps the searches from other starts have ended apart; 14 evaluations are not enough
+    assert found.converged is False and bool(found.unsure) == (name == "diffcloud")
+    assert from_json(as_json(found)).converged is False
+    words = f"not sure of the minimum: {found.unsure}" if found.unsure else "not converged: "
+    assert any(line.startswith("search") and f": {words}" in line for line in describe(found))
 
 
 @pytest.mark.slow(group="estimates")

@@ -5,8 +5,10 @@ import jax.random as jr
 import numpy as np
 import pytest
 
+from r2s.estimation.default_spaces import law_of, on_cloth, with_law
 from r2s.estimation.method import default_space
 from r2s.materials import presets, prior
+from r2s.materials.parameters import EXTENDED
 from r2s.study.recordings import small_strain
 
 SPACE = default_space("cloth", float(presets.grey_interlock().density))
@@ -55,3 +57,11 @@ def test_the_middle_of_the_prior_is_the_median_of_its_draws():
     assert float(middle.friction) == pytest.approx(float(jnp.median(drawn.friction)), abs=0.02)
     with pytest.raises(ValueError, match="density must be positive"):
         prior.middle(0.0)
+
+
+def test_a_law_of_the_list_adds_its_numbers_and_another_is_refused():
+    space = on_cloth(0.2)
+    for law in ("linear", *EXTENDED, "+".join(EXTENDED)):
+        assert law_of(with_law(space, law).ranges) == law
+    with pytest.raises(ValueError, match="no law 'presoftening'; there are linear, stiffening"):
+        with_law(space, "presoftening")

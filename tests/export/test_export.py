@@ -60,7 +60,7 @@ def test_the_probes_are_what_a_pulled_strip_shows():
 def test_bending_is_that_of_a_cylinder_in_each_direction():
     law = OrthotropicPlate(*map(jnp.asarray, (1e-5, 2e-5, 4e-5)))
     bending = stiffness.bending_stiffness(dataclasses.replace(DENIM, bending=law))
-    expected = {"warp": 1e-5, "bias": 2e-5, "weft": 4e-5, "other bias": 2e-5}
+    expected = {"warp": 1e-5, "45 deg": 2e-5, "weft": 4e-5, "-45 deg": 2e-5}
     assert bending == pytest.approx(expected, rel=1e-9)
     plate = dataclasses.replace(DENIM, bending=PlateBending.make(3e-5, 0.4))
     expected = dict.fromkeys(stiffness.DIRECTIONS, 3e-5)

@@ -81,3 +81,10 @@ def test_a_run_that_fails_is_lost_from_there_on_and_says_why(monkeypatch):
     moved = prediction_error.predict_motion(scenario, presets.grey_interlock())
     assert np.isfinite(moved.x).all(axis=(1, 2)).tolist() == [True, False, False]
     assert "failed at 0.05 s" in moved.failure
+
+
+def test_every_metric_has_a_unit_and_words():
+    one, other = np.eye(3), 1.1 * np.eye(3) + 0.01
+    values = prediction_error.distances(one, other)
+    values |= prediction_error.paper_units(one, other, one, other)
+    assert values.keys() | {"surface"} == prediction_error.METRICS.keys()
