@@ -37,7 +37,13 @@ def _images(folder: Path) -> Iterator[tuple[Path, np.ndarray]]:
     cv2 = require("cv2", "camera", "videos and images")
     from r2s.recordings.clocks import find_frames
 
-    for file in find_frames(folder, IMAGES).files:
+    frames = find_frames(folder, IMAGES)
+    if missing := sorted(set(range(frames.numbers[-1] + 1)) - set(frames.numbers)):
+        raise ValueError(
+            f"{folder}: frame {missing[0]} (counted from the first) is missing, {len(missing)} in "
+            "all: restore it, or number the frames without gaps and give their times"
+        )
+    for file in frames.files:
         if file.suffix.lower() == ".png":
             read_png(file)  # of a cut one OpenCV takes the rows that are there
         image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)

@@ -179,9 +179,20 @@ def default_manifest() -> Path:
 
 
 def manifest_of(folder: Path | str) -> Path:
-    """The file of a folder of recordings: its own `manifest.json`, else the default one."""
-    own = Path(folder) / "manifest.json"
-    return own if own.exists() else default_manifest()
+    """The file of a folder of recordings: its own `manifest.json`, or the default one where the
+    grippers' paths are those of DIFFCLOUD. Raises ValueError for another folder without."""
+    folder = Path(folder)
+    if (own := folder / "manifest.json").exists():
+        return own
+    published = read_manifest(default_manifest())
+    for name in {scenario.gripper.file for scenario in published.scenarios.values()}:
+        file = folder / name
+        if file.is_file() and hash_values(read_values(file)) == published.files.get(name):
+            return default_manifest()
+    raise ValueError(
+        f"{folder}: no manifest.json, which gives scale, frame rate, sheet and grippers: copy "
+        "data_manifests/templates/study.json there and edit it"
+    )
 
 
 def manifest_for(folder: Path | str) -> Manifest:

@@ -47,9 +47,12 @@ def pair(
     their mean time; others stand alone. 0: `TOGETHER`, or a quarter of the shortest interval of a
     camera if that is less.
     """
+    if max(t[0] for t in times.values()) > min(t[-1] for t in times.values()):
+        spans = ", ".join(f"{name} {t[0]:g} to {t[-1]:g} s" for name, t in times.items())
+        raise ValueError(f"the cameras never ran at once: {spans}: check that they share a clock")
     if tolerance == 0:
-        shortest = min(float(np.diff(t).min()) for t in times.values() if len(t) > 1)
-        tolerance = min(TOGETHER, shortest / 4)
+        gaps = np.concatenate([np.diff(t) for t in times.values()])
+        tolerance = min(TOGETHER, float(gaps.min(initial=1.0)) / 4)
     events = sorted((t, name, i) for name, clock in times.items() for i, t in enumerate(clock))
     groups: list[list[tuple[float, str, int]]] = []
     for event in events:
@@ -155,7 +158,11 @@ def stream(
     times = {name: times_of(folder / name, frames, rate) for name, (frames, _) in files.items()}
     last: dict[str, bytes] = {}
     is_compared = False
-    for frame, (time, chosen) in enumerate(pair(times, rig.pair_tolerance)):
+    try:
+        frames_of = pair(times, rig.pair_tolerance)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from error
+    for frame, (time, chosen) in enumerate(frames_of):
         parts = {}
         for name, index in chosen.items():
             frames, masks = files[name]

@@ -98,7 +98,7 @@ def folder(tmp_path: Path) -> Path:
         ("cloud rotation", [[1, 0, 0], [0, 1, 0], [0, 0, 1.01]], "orthonormal"),
         ("cloud rotation", [[0, 1, 0], [1, 0, 0], [0, 0, 1]], "determinant"),
         ("cloud rotation", [[1, 0], [0, 1]], "rotation: expected 3 entries"),
-        ("frame_rate", 0, "frame_rate must be positive .Hz., found 0"),
+        ("frame_rate", -1, "frame_rate must not be negative .Hz., found -1"),
         ("sheet size", [0.3, -0.2], "sheet: .*sides must be positive"),
         ("sheet held", ["left"], "unknown corner 'left'"),
         ("frames_used", [2, 1], "frames_used must be"),
@@ -198,7 +198,7 @@ def test_a_listed_file_that_differs_or_lacks_is_warned_of(folder: Path, is_missi
     [
         (GRIPPER[:1], r"pull_tan: the gripper path ends at 0 s, before the last frame at 0.09 s"),
         (GRIPPER[:, :2], r"gripper.npy: .*expected \(knot, 3\)"),
-        (GRIPPER * np.nan, "gripper.npy: the gripper path: 2 of 2 are not finite"),
+        (GRIPPER * np.nan, "gripper.npy: the path: 2 of 2 are not finite"),
         (GRIPPER[:, None].repeat(2, axis=1), "the path has 2 grippers, the sheet is pinned at"),
         (None, "gripper.npy"),
     ],

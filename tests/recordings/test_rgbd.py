@@ -72,8 +72,8 @@ def test_cameras_are_paired_by_time(tmp_path: Path) -> None:
         (tmp_path / "right" / kind / "000.png").unlink()
     (tmp_path / "right" / "times.csv").write_text("".join(f"{t + 0.004}\n" for t in TIMES[1:]))
     times, clouds = read_clouds(tmp_path, scene)
-    np.testing.assert_allclose(times, TIMES[1:], atol=1e-6)
-    for frame, points in enumerate(clouds, 1):
+    np.testing.assert_allclose(times, [0, *(TIMES[1:] + 0.002)], atol=1e-6)
+    for frame, points in enumerate(clouds):
         assert distances(points, surface(frame)).mean() < 2e-3
 
 
