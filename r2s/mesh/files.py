@@ -60,7 +60,7 @@ def read_mesh(
     Raises `FileNotFoundError`, `ImportError` without trimesh, and a `ValueError` that names the
     file and what is wrong: several pieces, layers, edges of three faces, cuts, no plane, the unit.
     """
-    path, changes, notes = Path(path), [], []
+    path, changes, notes = Path(path), [], [] if scale else ["lengths taken as metres"]
     trimesh = require("trimesh", "study", f"{path}: mesh files")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such mesh file")
@@ -101,7 +101,7 @@ def read_mesh(
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if strict and changes:
-        raise ValueError(f"{path}: strict, but {'; '.join(changes)}")
+        raise ValueError(f"{path}: a strict reading changes nothing, but {'; '.join(changes)}")
     return MeshFile(mesh, x[order], vertices[order], changes, notes)
 
 
@@ -114,15 +114,15 @@ def _read(path: Path, trimesh: Any, uv: bool) -> tuple[np.ndarray, np.ndarray | 
     else:
         try:
             loaded = trimesh.load_mesh(path, process=False)
-            faces, texture = np.asarray(loaded.faces, int), getattr(loaded.visual, "uv", None)
-            places = np.asarray(loaded.vertices, float)
+            faces, texture = np.reshape(loaded.faces, (-1, 3)), getattr(loaded.visual, "uv", None)
+            places = np.array(loaded.vertices, float).reshape(-1, 3)
         except Exception as error:  # trimesh raises anything, from KeyError to its own types
             raise ValueError(f"is no {kind[1:]} file: {error!r}: export it again") from error
         first, second = np.array_split(faces, 2)  # so trimesh cuts quadrilaterals
         if kind not in SPLIT and np.array_equal(first[:, [0, 2]], second[:, [2, 0]]):
             faces = np.column_stack([first, second[:, 1]])
         polygons = np.stack([faces, faces], axis=-1)
-    expect(len(polygons) > 0, "there are no faces: export the mesh, not its points alone")
+    expect(len(polygons) > 0, "there are no faces: export the whole mesh, not its points alone")
     expect(not uv or texture is not None, "its corners have no texture coordinates: export them")
     tables = [("v", places), ("vt", texture)][: 1 + uv]
     for (name, table), index in zip(tables, np.concatenate([*polygons]).T, strict=False):
@@ -139,15 +139,17 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray | None, Any]:
     text = path.read_text(encoding="utf-8-sig", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
         kind, *words = line.partition("#")[0].split() or [""]
+        if kind not in table:
+            continue
         try:
+            least, size = (1, 2) if kind == "vt" else (3, 3)
+            expect(len(words) >= least, f"expected {least} entries or more")
             if kind == "f":
-                expect(len(words) > 2, "a face has three corners or more")
                 index = np.array([[int(k or 0) for k in [*w.split("/"), 0][:2]] for w in words])
                 count = [len(table["v"]), len(table["vt"])]
                 table["f"].append(index + np.where(index < 0, count, -1))
-            elif kind in table:
-                size = 3 if kind == "v" else 2
-                table[kind].append(np.array(words[:size], float).reshape(size))
+            else:
+                table[kind].append(np.array([*words, "0"][:size], float))
         except ValueError as error:
             raise ValueError(f"line {number}, {line.strip()[:50]!r}: {error}") from None
     textured = table["vt"] and all(np.all(face[:, 1] >= 0) for face in table["f"])
@@ -181,11 +183,11 @@ def _one_layer(
         sizes = ", ".join(f"{each:.3g}" for each in np.sort(area)[::-1][:4])
         words = f"{len(area)} pieces (areas {sizes}{', ...' * (len(area) > 4)} m^2)"
         rest, others = np.unique(sheet.faces[main]), np.unique(sheet.faces[~main])
-        gap = 1e3 * np.sort(cKDTree(places[rest]).query(places[others])[0])
-        words += f", whose nearest vertices are {gap[0]:.3g} mm apart"
-        remedy = "join them (--weld) or take the largest (--largest)"
+        gap = 1e3 * np.min(cKDTree(places[rest]).query(places[others])[0])
+        words += f" whose nearest vertices are {gap:.3g} mm apart"
+        remedy = "join them where they were made or by --weld, or take the largest (--largest)"
         expect(largest, f"the sheet is in {words}: {remedy}")
-        changes.append(f"of {words}, the largest is taken")
+        changes.append(f"of {words} the largest is taken")
     return corners[main]
 
 
@@ -196,20 +198,19 @@ def _plane(
     _, _, axes = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)
     size, width, off = 1e3 * np.ptp(x @ axes.T, axis=0)
     expect(width > WELD * size, "the vertices lie on a line")
-    words = f"it is not plane at rest but deviates by {off:.3g} mm over {size:.4g} mm"
-    expect(
-        off < PLANE * size, f"{words}: lay it flat, or take the rest shape of its texture (--uv)"
-    )
+    words = f"not plane at rest, it deviates by {off:.4g} mm over {size:.4g} mm"
+    expect(off < PLANE * size, f"{words}: lay it flat, or take the shape of its texture (--uv)")
     if off > WELD * size:
-        changes.append(f"{words}, and is flattened")
+        changes.append(f"{words}: it is flattened")
     across = 2 - int(np.argmax(np.round(np.abs(axes[2, ::-1]), 3)))  # of equal ones z, y
     tilted = bool(1e3 * np.ptp(x[:, across]) > off + WELD * size)
     normal = axes[2] * np.sign(axes[2, across]) if tilted else np.eye(3)[across]
     along = int(across == 0)
     warp = np.eye(3)[along] - normal[along] * normal
     warp /= np.linalg.norm(warp)
-    angle = f", tilted by {np.degrees(np.arccos(min(1, normal[across]))):.2g} degrees" * tilted
-    notes.append(f"plane across {'xyz'[across]} of the file{angle}; warp along {'xyz'[along]}")
+    degrees = np.degrees(np.arccos(min(1, normal[across])))
+    words = f", tilted by {degrees:.2g} degrees; warp along projected" if tilted else "; warp along"
+    notes.append(f"plane across {'xyz'[across]} of the file{words} {'xyz'[along]}")
     return x @ np.stack([warp, np.cross(normal, warp)], axis=1), tilted
 
 
@@ -234,14 +235,12 @@ def _unwrapped(
 
 
 def _check_unit(size: np.ndarray, scale: float | None) -> None:
-    low, high = SIDES
-    fits = [
-        f"{k} ({max(size) * m:.3g} m)" for k, m in UNITS.items() if low <= max(size) * m <= high
-    ]
+    low, high, side = *SIDES, float(max(size))
+    fits = [f"{k} ({side * m:.3g} m)" for k, m in UNITS.items() if low <= side * m <= high]
     words = f"the sheet is {size[0]:.4g} by {size[1]:.4g}, hardly in metres"
     words += ": in centimetres, millimetres or inches? State it"
     remedy = f"--unit {' or '.join(fits) or 'm'}; scale=metres per unit"
-    expect(bool(scale) or low <= max(size) <= high, f"{words}: {remedy}")
+    expect(scale is not None or low <= side <= high, f"{words}: {remedy}")
 
 
 def _border(
@@ -254,9 +253,7 @@ def _border(
     length = np.linalg.norm(step, axis=1)
     sides, count = np.unique(sheet.edges, axis=0, return_counts=True)
     place = np.round(rest[sides[np.argmax(count), 0]], 4)
-    expect(
-        max(count) < 2, f"faces lie over each other at {place} m: a sheet is one layer, unfolded"
-    )
+    expect(max(count) < 2, f"faces lie over each other at {place} m: a sheet is one flat layer")
     loop = trimesh.graph.connected_component_labels(ends, len(rest))[ends[:, 0]]
     for each in np.unique(loop):
         ring, start = loop == each, ends[np.argmax(loop == each), 0]
@@ -272,8 +269,8 @@ def _border(
     straight = step[np.argmax(length * (bins == np.argmax(total)))] @ [1, 1j]
     angle = np.angle((straight / abs(straight)) ** 4) / 4
     if np.max(total) > STRAIGHT * np.sum(length) and abs(angle) > (1e-9 if tilted else SQUARE):
-        words = f"by {np.degrees(angle):.3g} degrees, to the direction of most of the border"
-        notes.append(f"warp {'' if tilted else 'not '}turned {words}")
+        words = f"most of the border is at {np.degrees(angle):.3g} degrees to this warp"
+        notes.append(f"{words}, which {'is turned there' if tilted else 'stays'}")
         turned = rest @ [1, 1j] * np.exp(-1j * angle * tilted)
         rest = np.column_stack([turned.real, turned.imag])
     return rest

@@ -144,7 +144,9 @@ def test_the_doctor_looks_at_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert main(["doctor", "--mesh", str(path)]) == 0
     assert "    1 of 2 faces, clockwise, are turned over" in capsys.readouterr().out
     assert main(["doctor", "--mesh", str(path), "--strict"]) == 1
-    assert "sheet.obj: strict, but 1 of 2 faces" in capsys.readouterr().err
+    assert (
+        "sheet.obj: a strict reading changes nothing, but 1 of 2 faces" in capsys.readouterr().err
+    )
     path.write_text(corners.replace("0.2", "20") + "f 1 2 3\nf 2 4 3\n")
     assert main(["doctor", "--mesh", str(path)]) == 1
     assert "20 by 20, hardly in metres: in centimetres," in capsys.readouterr().err
