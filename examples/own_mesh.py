@@ -2,14 +2,13 @@
 
     python examples/own_mesh.py [sheet.obj]
 
-Any flat triangle mesh will do: no grid is needed. `r2s doctor --mesh sheet.obj` checks a file.
+Any plane mesh will do: no grid is needed. `r2s doctor --mesh sheet.obj` checks a file.
 Needs trimesh: pip install 'r2s[study]'
 """
 
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -45,9 +44,10 @@ if __name__ == "__main__":
     if not sys.argv[1:]:
         write_disc(file := Path(tempfile.mkdtemp()) / "disc.obj")
     path = sys.argv[1] if sys.argv[1:] else file
-    loaded: Any = trimesh.load(path, process=False, force="mesh")
-    sheet = r2s.Mesh.make(np.asarray(loaded.vertices)[:, :2], np.asarray(loaded.faces))
-    middle = jnp.asarray(np.flatnonzero(np.linalg.norm(sheet.rest, axis=1) < 0.07))
+    file = r2s.read_mesh(path)
+    print(*file.changes, *file.notes, sep="\n")
+    sheet, centre = file.mesh, np.mean(file.mesh.rest, axis=0)
+    middle = jnp.asarray(np.flatnonzero(np.linalg.norm(sheet.rest - centre, axis=1) < 0.07))
     solver = r2s.ImplicitCloth(r2s.Scene(sheet, middle), dt=0.02)
     start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
     control = r2s.Control(jnp.broadcast_to(start[middle], (75, len(middle), 3)))

@@ -30,6 +30,7 @@ from r2s.materials.parameters import (
 from r2s.materials.plate import OrthotropicPlate, PlateBending, PlateLaw
 from r2s.materials.stiffening import StiffeningMembrane
 from r2s.materials.tables import TableBending, TableMembrane
+from r2s.mesh.files import MeshFile, read_mesh
 from r2s.mesh.mesh import Mesh, rectangle
 from r2s.metrics.prediction_error import distances
 from r2s.recordings.manifest import read_recordings
@@ -67,6 +68,8 @@ __all__ = [
     # the sheet, and what it meets
     "Mesh",
     "rectangle",
+    "read_mesh",
+    "MeshFile",
     "Scene",
     "Control",
     "along_path",

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -118,7 +118,17 @@ class Doctor:
 
     fabric: FabricName = ""
     mesh: Annotated[Path | None, arg(metavar="FILE")] = None
-    """A flat triangle mesh in metres, as OBJ, PLY or STL."""
+    """A plane sheet in an OBJ, PLY, OFF, STL or glTF file; the next five options are of it."""
+    unit: Literal["m", "cm", "mm", "in"] | None = None
+    """Of the mesh's lengths; by default metres, if its size is that of a sheet."""
+    uv: bool = False
+    """The rest shape is that of its texture coordinates."""
+    weld: float | None = None
+    """Vertices nearer than this are one, [m]; by default 1e-5 of the extent."""
+    largest: bool = False
+    """Of several pieces the largest is taken."""
+    strict: bool = False
+    """Refuse a mesh that would be changed."""
     scenario: Annotated[ScenarioName | None, arg(metavar="SCENARIO")] = None
     """A scenario of the study, whose motion is checked, too."""
     motion: Motion = ()
@@ -135,8 +145,8 @@ class Doctor:
             lines += more
             wrong += [f"{card.name}: {text}" for text in result["fabric"]["implausible"]]
         if self.mesh is not None:
-            result["mesh"], text = _mesh(self.mesh)
-            lines.append(text)
+            result["mesh"], more = self._mesh(self.mesh)
+            lines += more
         if self.scenario is not None:
             result["scenario"], more = self._scenario(self.scenario)
             lines += more
@@ -145,6 +155,31 @@ class Doctor:
         result["wrong"] = wrong
         print_result(self.json, result, [*lines, *(f"WRONG: {text}" for text in wrong)])
         return 1 if wrong else 0
+
+    def _mesh(self, path: Path) -> tuple[dict[str, Any], list[str]]:
+        import numpy as np
+
+        from r2s.mesh.files import UNITS, read_mesh
+
+        options = {key: getattr(self, key) for key in ("uv", "weld", "largest", "strict")}
+        read = read_mesh(path, scale=UNITS.get(self.unit or ""), **options)
+        mesh = read.mesh
+        rest, faces, hinges = (np.asarray(each) for each in (mesh.rest, mesh.faces, mesh.hinges))
+        edges = np.linalg.norm(rest[faces] - rest[np.roll(faces, 1, axis=1)], axis=-1)
+        result = {
+            "vertices": len(rest),
+            "faces": len(faces),
+            "inner_edges": len(hinges),
+            "area_m2": float(np.sum(mesh.area)),
+            "shortest_edge_m": float(edges.min()),
+            "longest_edge_m": float(edges.max()),
+            "changes": read.changes,
+            "notes": read.notes,
+        }
+        size = f"{len(rest)} vertices, {len(faces)} faces, {len(hinges)} inner edges, one piece"
+        edge = f"edges {1e3 * edges.min():.2f} to {1e3 * edges.max():.2f} mm"
+        lines = [f"mesh {path.name}: sound; {size}, {result['area_m2']:.4g} m^2, {edge}"]
+        return result, lines + [f"    {text}" for text in [*read.changes, *read.notes]]
 
     def _scenario(self, name: str) -> tuple[dict[str, Any], list[str]]:
         import equinox as eqx
@@ -263,35 +298,3 @@ def implausible(fabric: "Fabric") -> Iterator[str]:
             yield f"{name} is {value:g} {unit}, expected {low:g} to {high:g} ({what})"
     if not np.all(np.linalg.eigvalsh(matrix) > 0):
         yield "the membrane has a negative stiffness: C12^2 must be less than C11 C22"
-
-
-def _mesh(path: Path) -> tuple[dict[str, Any], str]:
-    import numpy as np
-
-    from r2s._util.extras import require
-    from r2s.mesh.mesh import Mesh
-
-    trimesh = require("trimesh", "study", "mesh files")
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such mesh")
-    loaded: Any = trimesh.load(path, process=False, force="mesh")
-    places, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
-    extent = np.ptp(places, axis=0)
-    flat = int(np.argmin(extent))
-    if extent[flat] > 1e-6 * extent.max():
-        raise ValueError(f"{path}: a rest shape must lie in a plane, it extends over {extent} m")
-    try:
-        mesh = Mesh.make(np.delete(places, flat, axis=1), faces)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    edges = loaded.edges_unique_length
-    result = {
-        "vertices": len(places),
-        "faces": len(faces),
-        "area_m2": float(np.sum(np.asarray(mesh.area))),
-        "shortest_edge_m": float(edges.min()),
-        "longest_edge_m": float(edges.max()),
-    }
-    size = f"{result['vertices']} vertices, {result['faces']} faces, {result['area_m2']:.4g} m^2"
-    edge = f"edges {1e3 * edges.min():.2f} to {1e3 * edges.max():.2f} mm"
-    return result, f"mesh {path.name}: sound; {size}, {edge}"

@@ -141,8 +141,17 @@ def test_the_doctor_looks_at_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixtur
     told = json.loads(capsys.readouterr().out)["mesh"]
     assert told["faces"] == 2 and told["area_m2"] == pytest.approx(0.04)
     path.write_text(corners + "f 1 2 3\nf 2 3 4\n")  # one is clockwise
+    assert main(["doctor", "--mesh", str(path)]) == 0
+    assert "    1 of 2 faces, clockwise, are turned over" in capsys.readouterr().out
+    assert main(["doctor", "--mesh", str(path), "--strict"]) == 1
+    assert (
+        "sheet.obj: a strict reading changes nothing, but 1 of 2 faces" in capsys.readouterr().err
+    )
+    path.write_text(corners.replace("0.2", "20") + "f 1 2 3\nf 2 4 3\n")
     assert main(["doctor", "--mesh", str(path)]) == 1
-    assert "sheet.obj: face 1 has the signed area" in capsys.readouterr().err
+    assert "20 by 20, hardly in metres: in centimetres," in capsys.readouterr().err
+    assert main(["doctor", "--mesh", str(path), "--unit", "cm"]) == 0
+    assert "one piece, 0.04 m^2, edges 200.00 to" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("density", ["150", "0.0003"])
