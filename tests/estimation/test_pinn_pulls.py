@@ -104,17 +104,32 @@ def test_bad_input_is_explained(says):
         pull_from(recording(**BAD[says]))
 
 
-def test_a_recording_without_markers_even_frames_or_four_clamped_corners_is_refused():
+def test_a_recording_without_markers_or_four_clamped_corners_is_refused():
     whole = recording()
     held = dataclasses.replace(whole.info, sheet=dataclasses.replace(SHEET, pinned=("origin",)))
     changes = {
         "no markers": {"markers": None, "markers_seen": None},
-        "evenly spaced": {"times": whole.times.at[4].add(0.01)},
         "four corners": {"info": held},
     }
     for says, change in changes.items():
         with pytest.raises(ValueError, match=says):
             pull_from(dataclasses.replace(whole, **change))
+
+
+def test_frames_at_uneven_times_show_the_same_pull():
+    """Of markers that move evenly, to the curvature of their path between two frames."""
+    whole = recording()
+    times = np.asarray(whole.times, np.float64)
+    late = times + 0.2 * (times[1] - times[0]) * np.array([0, 1, -1, 1, 0, -1, 1, -1, 0])
+    far = np.interp(late, whole.gripper_times, whole.gripper_path[:, 2, 0]) - SIDE
+    even = np.interp(times, whole.gripper_times, whole.gripper_path[:, 2, 0]) - SIDE
+    share = np.asarray(whole.markers)[0, :, 0] / SIDE
+    moved = np.asarray(whole.markers).copy()
+    moved[..., 0] += share[None] * (far - even)[:, None]
+    shifted = dataclasses.replace(whole, times=jnp.asarray(late), markers=jnp.asarray(moved))
+    one, other = pull_from(whole), pull_from(shifted)
+    np.testing.assert_allclose(other.times, one.times, atol=1e-6)
+    np.testing.assert_allclose(other.displacement, one.displacement, atol=0.03 * PULLED)
 
 
 def test_pulls_with_and_without_force_or_of_other_lengths_do_not_go_together():

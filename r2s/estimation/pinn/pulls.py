@@ -20,7 +20,7 @@ from r2s._util.checks import expect
 from r2s._util.units import GRAVITY
 from r2s.estimation.problem import force_at
 from r2s.materials.fabric import Fabric
-from r2s.recordings.recording import Recording, RecordingInfo, make_recording
+from r2s.recordings.recording import Recording, RecordingInfo, interpolated, make_recording
 from r2s.scenarios import clamp_force, energy_balance, stretching
 from r2s.scenarios.standard import STRETCHING_INTERVAL
 from r2s.scenarios.synthetic import MARKER_NOISE, markers_of
@@ -104,12 +104,12 @@ def _pull(recording: Recording, without_force: bool) -> Pull:
     sheet, (first, last) = recording.info.sheet, recording.info.frames_used
     size, used = np.asarray(sheet.size), slice(first, last + 1)
     axes = np.array([sheet.warp, sheet.weft, np.cross(sheet.warp, sheet.weft)])
-    times = np.asarray(recording.times, np.float64)[used]
-    expect(len(times) >= FEWEST_FRAMES, f"{len(times)} frames: at least {FEWEST_FRAMES} are needed")
-    steps = np.diff(times)
-    expect(np.ptp(steps) <= 0.01 * steps.mean(), "frames must be evenly spaced: resample")
+    count = last - first + 1
+    expect(count >= FEWEST_FRAMES, f"{count} frames: at least {FEWEST_FRAMES} are needed")
     if recording.markers is None or recording.markers_seen is None:
         raise ValueError("no markers: track them in each frame (r2s.recordings.markers.track)")
+    recording = _evened(recording, used)
+    times = np.asarray(recording.times, np.float64)[used]
     seen = np.asarray(recording.markers_seen)[used]
     world = np.asarray(recording.markers, np.float64)[used]
     local = (world - np.asarray(sheet.origin)) @ axes.T
@@ -134,6 +134,24 @@ def _pull(recording: Recording, without_force: bool) -> Pull:
         force=None if force is None else array(force),
         gravity=array(down[:2]),
         normal=array(abs(down[2])),
+    )
+
+
+def _evened(recording: Recording, used: slice) -> Recording:
+    """The recording with the frames that count at even times, as equilibrium is computed from frame
+    to frame. Markers are linear in between, and seen where they are in both frames around."""
+    times = np.asarray(recording.times, np.float64)[used]
+    even, steps = np.linspace(times[0], times[-1], len(times)), np.diff(times)
+    if np.ptp(steps) <= 0.01 * steps.mean():
+        return recording
+    markers, seen = np.asarray(recording.markers), np.asarray(recording.markers_seen)
+    between = interpolated(even, times, seen[used].astype(float)) > 1 - 1e-9
+    places = interpolated(even, times, np.asarray(markers[used], np.float64))
+    return dataclasses.replace(
+        recording,
+        times=recording.times.at[used].set(jnp.asarray(even, float)),
+        markers=jnp.asarray(markers, float).at[used].set(jnp.asarray(places, float)),
+        markers_seen=jnp.asarray(seen).at[used].set(jnp.asarray(between)),
     )
 
 
