@@ -1,5 +1,6 @@
 """Recordings and simulated motions from paths; conversion of folders to NPZ files."""
 
+import contextlib
 import hashlib
 import re
 from collections.abc import Iterator, Sequence
@@ -124,10 +125,13 @@ def _names(folder: Path, only: str) -> tuple[Path, list[str]]:
         wanted = re.compile(only)
     except re.error as error:
         raise ValueError(f"only: {only!r} is no regular expression: {error}") from error
-    known = read_recordings(folder, manifest_for(folder))
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder of recordings")
     one = folder.resolve()
-    if not known and one.name in read_recordings(one.parent, manifest_for(one.parent)):
-        return one.parent, [one.name]
+    with contextlib.suppress(ValueError):  # no manifest
+        if one.name in read_recordings(one.parent, manifest_for(one.parent)):
+            return one.parent, [one.name]
+    known = read_recordings(folder, manifest_for(folder))
     if not known:
         raise ValueError(
             f"{folder}: no recording whose name fits a scenario of {manifest_of(folder)}: write a "

@@ -214,7 +214,7 @@ def between(
     both ends (Hermite). Places count saves from 0; what lies beyond the ends is taken as there."""
     places = jnp.clip(places, 0, len(x) - 1)
     step = jnp.clip(jax.lax.stop_gradient(places).astype(int), 0, len(x) - 2)
-    s = (places - step).astype(x.dtype)[:, None, None]
+    s = (places - step.astype(places.dtype)).astype(x.dtype)[:, None, None]
     (x0, x1), (v0, v1) = (x[step], x[step + 1]), (v[step] * dt, v[step + 1] * dt)
     over = x1 - x0
     at = x0 + s * (v0 + s * (3 * over - 2 * v0 - v1 + s * (v0 + v1 - 2 * over)))
