@@ -258,8 +258,8 @@ def _conditions(problem: Problem, theta: Theta):
 
 
 def _move(problem: Problem, theta: Theta):
-    """Vertices at all simulated frames [m], with their velocities [m/s] where `is_between`, and the
-    clamp's force at the frames that count [N]; whether all is finite."""
+    """Vertices at all simulated frames [m], with their velocities [m/s] where frames lie between
+    these, and the clamp's force at the frames that count [N]; whether all is finite."""
     scenario, fabric, solver = _conditions(problem, theta)
     simulated = dataclasses.replace(scenario, frame_times=None)
     force = None
@@ -270,21 +270,19 @@ def _move(problem: Problem, theta: Theta):
         moved = energy_balance(simulated, fabric, solver=solver)
         on_clamp = clamp_force(scenario, moved)[jnp.array(problem.frames)]
         force, ok = on_clamp @ problem.force.directions.T, jnp.all(jnp.isfinite(moved.x))
-    x = jnp.stack([moved.x, moved.v], axis=1) if is_between(problem) else moved.x
+    is_between = scenario.frame_times is not None
+    x = jnp.stack([moved.x, moved.v], axis=1) if is_between else moved.x
     return (x, force), ok
-
-
-def is_between(problem: Problem) -> bool:
-    """Whether frames may lie between those that are simulated: at uneven times, or where the
-    cameras' clock is in doubt."""
-    return problem.scenario.frame_times is not None or problem.nuisance_prior.time > 0
 
 
 def _seen_from(problem: Problem, x: Array, theta: Theta):
     """What `_move` gives, in the cameras' frame, at the frames that count of their clock: where
     that is late by some time, a frame is of an earlier one."""
     prior, own = problem.nuisance_prior, theta[problem.space.dim + len(SHARED) :]
-    if is_between(problem):
+    if problem.scenario.frame_times is None:
+        if prior.time:
+            raise ValueError("give the doubt of a clock to Problem.make: its frames lie in between")
+    else:
         x, _ = at_frames(problem.scenario, x[:, 0], x[:, 1], prior.time * own[4])
     x = x[jnp.array(problem.frames)]
     pivot = x[:, problem.scenario.scene.pinned[:1]]

@@ -28,7 +28,7 @@ from r2s.recordings.recording import (
 )
 from r2s.recordings.views import Views
 from r2s.scenarios.resolution import mpm_cloth
-from r2s.scenarios.scenario import Scenario, from_recording, rollout
+from r2s.scenarios.scenario import Scenario, finely_saved, from_recording, rollout
 
 POINTS = 300  # at most, of a cloud
 TARGETS = 1200  # at most, of a cloud that the sheet must lie near
@@ -211,6 +211,9 @@ class Problem(eqx.Module):
             if as_seen and scenario.brake is not None and begins:
                 middle = space(jnp.full(space.dim, 0.5, float))
                 scenario = start_as_seen(scenario, middle, clouds.points[0], clouds.mask[0])
+        nuisances = nuisance_prior or default_nuisance_prior(scenario, recording.info.doubt)
+        if nuisances.time:  # frames of a clock that is late lie between those simulated
+            scenario = finely_saved(scenario)
         return cls(
             scenario,
             space,
@@ -218,7 +221,7 @@ class Problem(eqx.Module):
             clouds,
             markers,
             force_at(recording, frames) if recording.info.scenario == "stretching" else None,
-            nuisance_prior=nuisance_prior or default_nuisance_prior(scenario, recording.info.doubt),
+            nuisance_prior=nuisances,
             expected=expected,
         )
 

@@ -250,9 +250,11 @@ def _interval(times: Float[np.ndarray, " frame"]) -> tuple[float, bool]:
     interval = float(np.mean(intervals))
     if np.all(np.abs(intervals - interval) <= EVEN * interval):
         return round(interval, 9), True
-    numbers = np.cumsum(np.maximum(np.round(intervals / np.median(intervals)), 1))
-    since = times[1:] - times[0]
-    return float(f"{numbers @ since / (numbers @ numbers):.4g}"), False
+    short = float(np.quantile(intervals, 0.1))
+    if short > max(GRID, interval / 4):
+        numbers = np.cumsum(np.maximum(np.round(intervals / short), 1))
+        interval = float(numbers @ (times[1:] - times[0]) / (numbers @ numbers))
+    return float(f"{interval:.4g}"), False
 
 
 def _grip(
@@ -314,6 +316,24 @@ def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Sce
     if not info.angle:
         return scenario
     return dataclasses.replace(scenario, turn=jnp.asarray(math.radians(info.angle), float))
+
+
+def finely_saved(scenario: Scenario) -> Scenario:
+    """The scenario with the same steps, of which more are kept (`GRID`): for frames that may lie
+    between those of its own."""
+    if scenario.frame_times is not None:
+        return scenario
+    steps, step = scenario.substeps, scenario.interval / scenario.substeps
+    kept = max(k for k in range(1, steps + 1) if steps % k == 0 and (k == 1 or k * step <= GRID))
+    times = scenario.first_time + scenario.interval * jnp.arange(scenario.num_frames).astype(float)
+    return dataclasses.replace(
+        scenario,
+        interval=kept * step,
+        num_frames=(scenario.num_frames - 1) * (steps // kept) + 1,
+        lead_in=scenario.lead_in * (steps // kept),
+        substeps=kept,
+        frame_times=times,
+    )
 
 
 def as_cut(scenario: Scenario, fabric: Fabric) -> Fabric:

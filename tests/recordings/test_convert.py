@@ -86,7 +86,11 @@ def test_some_or_one_recording_alone(folder: Path, tmp_path: Path) -> None:
     for place, only, words in (
         (folder, "silk", "no recording whose name matches 'silk'; there are lift_"),
         (folder, "(lift", "'.lift' is no regular expression"),
-        (tmp_path / "empty", "", "empty: no manifest.json, which gives .*: copy data_manifests/templates"),
+        (
+            tmp_path / "empty",
+            "",
+            "empty: no manifest.json, which gives .*: copy data_manifests",
+        ),
         (tmp_path / "nowhere", "", "nowhere: no such folder"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=words):

@@ -43,8 +43,7 @@ def test_frames_off_their_times_lie_on_the_motion_between(even):
     late = np.array([0, 4, -3, 2, 4, -4, 1, -2, 3, 0]) * 1e-3
     motion = run(EVEN._replace(times=EVEN.times + late).scenario(SHAPE), FABRIC)
     moved = even.x + even.v * late[:, None, None]
-    np.testing.assert_allclose(motion.x, moved, atol=2e-4)
-    assert np.abs(moved - even.x).max() > 2e-3
+    assert np.abs(motion.x - moved).mean() < 0.1 * np.abs(moved - even.x).mean()
 
 
 def test_a_motion_that_ends_before_a_frame_is_no_motion_of_it():
