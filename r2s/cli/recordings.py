@@ -143,11 +143,13 @@ class Convert:
     """Convert those whose name matches this regular expression."""
     force: bool = False
     """Convert again what is up to date, as after an update of r2s."""
+    plot: bool = False
+    """Draw NAME_cuts.png beside NAME.npz: what a segmentation cut off, and what is left."""
 
     def run(self) -> None:
         from r2s.recordings.open import convert
 
-        for line in convert(self.folder, self.to, self.only, self.force):
+        for line in convert(self.folder, self.to, self.only, self.force, self.plot):
             print(line)
 
 

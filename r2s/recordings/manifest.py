@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from r2s._util.checks import naming
 from r2s._util.files import read_json
 from r2s._util.units import positive
 from r2s.recordings.cameras import is_rotation
@@ -23,6 +24,7 @@ from r2s.recordings.recording import (
     make_recording,
 )
 from r2s.recordings.rgbd import find_rig, read_clouds, read_rig
+from r2s.recordings.segmentation import FrameCuts, Segmentation, Segmenter, read_colours
 from r2s.recordings.views import Views, shifted
 
 Vector = tuple[float, float, float]
@@ -89,7 +91,8 @@ class Scenario:
 
     A folder with a cameras.json holds RGB-D images (`r2s.recordings.rgbd`) instead of clouds: the
     cameras' own times or rate come before `frame_rate`, `cloud` transforms from their world, and
-    no hashes are kept. If there are `sessions`, a recording belongs to one of them.
+    no hashes are kept. If there are `sessions`, a recording belongs to one of them. `segmentation`
+    cuts the cloth out of clouds, or of images without masks unless cameras.json has its own.
     """
 
     folder: str
@@ -105,6 +108,7 @@ class Scenario:
     sessions: tuple[Session, ...] = ()
     doubt: MeasurementUncertainty | None = None
     views: Views | None = None
+    segmentation: Segmentation | None = None
 
     def __post_init__(self) -> None:
         positive("Hz", frame_rate=self.frame_rate)
@@ -199,21 +203,35 @@ def read_recordings(
 def sources(folder: Path | str, manifest: Manifest, name: str) -> list[Path]:
     """The files that a recording is read from, as far as they exist, sorted.
 
-    Its manifest, the gripper's path, cameras.json, and all in its folder but colour images.
+    Its manifest, the gripper's path, cameras.json, and all in its folder, but colour images only
+    where a segmentation reads them.
     """
-    folder = Path(folder)
-    gripper = folder / _scenario_of(manifest, name)[1].gripper.file
-    inside = (path for path in (folder / name).rglob("*") if path.parent.name != "colour")
+    folder, scenario = Path(folder), _scenario_of(manifest, name)[1]
+    gripper = folder / scenario.gripper.file
+    how = _segmentation(folder / name, scenario)
+    left_out = () if how is not None and how.colour is not None else ("colour",)
+    inside = (path for path in (folder / name).rglob("*") if path.parent.name not in left_out)
     files = (manifest_of(folder), gripper, find_rig(folder / name), *inside)
     return sorted({path for path in files if path is not None and path.is_file()})
 
 
+def _segmentation(folder: Path, scenario: Scenario) -> Segmentation | None:
+    """How the cloth of the recording in a folder is cut out: as cameras.json says, else as here."""
+    own = read_rig(folder).segmentation if find_rig(folder) else None
+    return own or scenario.segmentation
+
+
 def read_recording(
-    folder: Path | str, manifest: Manifest, name: str, watch: Watch = iter
+    folder: Path | str,
+    manifest: Manifest,
+    name: str,
+    watch: Watch = iter,
+    cuts: list[FrameCuts] | None = None,
 ) -> Recording:
     """The recording in `folder`/`name`, of clouds or of RGB-D images, in metres and seconds.
 
-    Frames are read through `watch`, such as a bar that shows progress.
+    Frames are read through `watch`, such as a bar that shows progress. What a segmentation does to
+    each is appended to `cuts`.
 
     `info.verified`: True if all its files have the values listed in the manifest, None if some are
     not listed; False, with a warning, if a listed one differs or is missing.
@@ -223,18 +241,8 @@ def read_recording(
     folder = Path(folder)
     scenario_name, scenario, match = _scenario_of(manifest, name)
     path = _read_path(folder / scenario.gripper.file)
-    if find_rig(folder / name):
-        rig = read_rig(folder / name)
-        times, clouds = read_clouds(folder / name, rig, scenario.frame_rate, watch)
-        verified = None
-    else:
-        frames = list(find_numbered(folder / name, READERS, scenario.first_frame).values())
-        times = np.arange(len(frames)) / scenario.frame_rate
-        clouds = [read_cloud(frame) for frame in watch(frames)]
-        files = {f"{name}/{frame.name}": c for frame, c in zip(frames, clouds, strict=True)}
-        verified = _verify(manifest.files, name, files | {scenario.gripper.file: path})
-        if scenario.drop_repeats:
-            clouds = [_distinct(points) for points in clouds]
+    grippers = to_world(scenario.gripper.transform, path) + np.array(scenario.gripper.offset)
+    knots = np.arange(len(path)) / scenario.gripper.rate
     shift, views = (0.0, 0.0, 0.0), scenario.views
     if scenario.sessions:
         patterns = [session.recordings for session in scenario.sessions]
@@ -244,6 +252,29 @@ def read_recording(
             box = session.workspace or views.clean.workspace
             views = replace(views, clean=replace(views.clean, workspace=box))
             views = shifted(views, shift)
+    segmenter, how = None, _segmentation(folder / name, scenario)
+    if how is not None:
+        segmenter = Segmenter(
+            *(how, scenario.sheet, scenario.table_height, grippers, knots - scenario.time_offset),
+            to_world=lambda points: to_world(scenario.cloud, points) + np.array(shift),
+            frames=[] if cuts is None else cuts,
+        )
+        # what is cut off around a gripper was not seen
+        views = views and replace(views, hidden=max(views.hidden, how.gripper_radius))
+    if find_rig(folder / name):
+        rig = read_rig(folder / name)
+        times, clouds = read_clouds(folder / name, rig, scenario.frame_rate, watch, segmenter)
+        verified = None
+    else:
+        frames = list(find_numbered(folder / name, READERS, scenario.first_frame).values())
+        times = np.arange(len(frames)) / scenario.frame_rate
+        clouds = [read_cloud(frame) for frame in watch(frames)]
+        files = {f"{name}/{frame.name}": c for frame, c in zip(frames, clouds, strict=True)}
+        verified = _verify(manifest.files, name, files | {scenario.gripper.file: path})
+        if segmenter is not None:
+            clouds = _cut_out(segmenter, frames, times, clouds)
+        if scenario.drop_repeats:
+            clouds = [_distinct(points) for points in clouds]
     source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
     info = RecordingInfo(
         name=name,
@@ -262,10 +293,20 @@ def read_recording(
     return make_recording(
         [to_world(scenario.cloud, points) + np.array(shift) for points in clouds],
         times + scenario.time_offset,
-        to_world(scenario.gripper.transform, path) + np.array(scenario.gripper.offset),
-        np.arange(len(path)) / scenario.gripper.rate,
-        info,
+        *(grippers, knots, info),
     )
+
+
+def _cut_out(segmenter: Segmenter, files: Sequence[Path], times: Any, clouds: Any) -> list[Any]:
+    """The clouds of files at times without what is not of the cloth; errors name the file."""
+    kept = []
+    for file, time, points in zip(files, times, clouds, strict=True):
+        with naming(file):
+            colours = () if segmenter.how.colour is None else read_colours(file)
+            kept.append(points[segmenter(points, float(time), colours)])
+    with naming(files[0].parent):
+        segmenter.check()
+    return kept
 
 
 def _matching(name: str, patterns: Sequence[str], kind: str) -> tuple[int, re.Match[str]]:

@@ -4,7 +4,8 @@ The folder of a recording holds, for each camera that `cameras.json` names,
 
     NAME/depth/000.png ...   16-bit PNG, or NPY; `depth_scale` metres per unit, 0 for no depth
     NAME/masks/000.png ...   not zero where the fabric is; same numbers ("masks": false for none)
-    NAME/colour/000.png ...  PNG or JPG, same numbers; may be missing, is not read
+    NAME/colour/000.png ...  PNG or JPG, same numbers, in the pixels of the depth; may be missing,
+                             is read where a segmentation has a colour
     NAME/times.csv           seconds, in the last column; may be missing if `frame_rate` is given
 
 and `cameras.json` lies there, or in the folder above for all recordings of one set: the fields of
@@ -18,18 +19,20 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from r2s._util.checks import naming
 from r2s._util.files import read_json
 from r2s.recordings import images
 from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved
 from r2s.recordings.clouds import Cleaning, clean, find_numbered, inside
 from r2s.recordings.force_log import check_increasing, number_in, read_lines
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
+from r2s.recordings.segmentation import Segmentation, Segmenter
 
 NAME = "cameras.json"
 LONGEST = 5.0  # [s] between frames: above, times are taken for milliseconds or nanoseconds
@@ -118,6 +121,7 @@ class Rig:
     - `frame_rate`: for cameras without times.csv, [Hz]; 0: all have one.
     - `pair_tolerance`: what the times of frames that belong together may differ by, [s]; 0: half
       the interval between the first camera's frames.
+    - `segmentation`: how the cloth is cut out of what cameras without masks see; null: it is all.
     """
 
     cameras: Mapping[str, DepthCamera]
@@ -125,6 +129,7 @@ class Rig:
     frame_rate: float = 0.0
     pair_tolerance: float = 0.0
     note: str = ""
+    segmentation: Segmentation | None = None
 
     def __post_init__(self) -> None:
         if not self.cameras:
@@ -167,7 +172,11 @@ def rgbd_recording(
     `info.time_offset` is added to the cameras' times. `gripper_path`, `gripper_times`, `measured`
     (force, markers) and errors are as in `make_recording`; errors also as in `stream`.
     """
-    times, clouds = read_clouds(folder, rig or read_rig(folder))
+    rig, segmenter = rig or read_rig(folder), None
+    if rig.segmentation is not None:
+        path, knots = np.asarray(gripper_path), np.asarray(gripper_times) - info.time_offset
+        segmenter = Segmenter(rig.segmentation, info.sheet, info.table_height, path, knots)
+    times, clouds = read_clouds(folder, rig, segmenter=segmenter)
     clock = times + info.time_offset
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
 
@@ -177,26 +186,32 @@ def read_clouds(
     rig: Rig,
     frame_rate: float = 0.0,
     watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+    segmenter: Segmenter | None = None,
 ) -> tuple[Float[np.ndarray, " frame"], list[Float[np.ndarray, "point 3"]]]:
     """Times [s] on the cameras' clock, and the cleaned clouds [m]; raises as `stream`.
 
     Frames come through `watch`, such as a bar that shows progress.
     """
-    frames = list(watch(stream(folder, rig, frame_rate)))
+    frames = list(watch(stream(folder, rig, frame_rate, segmenter)))
     return np.array([time for time, _ in frames]), [cloud for _, cloud in frames]
 
 
 def stream(
-    folder: Path | str, rig: Rig, frame_rate: float = 0.0
+    folder: Path | str, rig: Rig, frame_rate: float = 0.0, segmenter: Segmenter | None = None
 ) -> Iterator[tuple[float, Float[np.ndarray, "point 3"]]]:
     """Time [s] and cleaned cloud [m] of one frame after the other: the images of one are in memory.
 
-    `frame_rate` [Hz] is used where the rig has none. Raises FileNotFoundError, ImportError (names
+    `frame_rate` [Hz] is used where the rig has none; the `segmenter` for cameras without masks,
+    and it must find a sheet. Raises FileNotFoundError, ImportError (names
     the extra), or ValueError that names the file or camera and frame, and what to do.
     """
     folder = Path(folder)
-    rate = rig.frame_rate or frame_rate
-    files = {name: _files(folder / name, camera) for name, camera in rig.cameras.items()}
+    if rig.segmentation is not None and segmenter is None:
+        raise ValueError(
+            f"{folder}: its segmentation needs a sheet and grippers: use rgbd_recording"
+        )
+    rate, coloured = rig.frame_rate or frame_rate, segmenter and segmenter.how.colour is not None
+    files = {n: _files(folder / n, camera, bool(coloured)) for n, camera in rig.cameras.items()}
     times = {name: frame_times(folder / name, len(files[name]), rate) for name in rig.cameras}
     try:
         pairs = pair(times, rig.pair_tolerance)
@@ -207,21 +222,48 @@ def stream(
     for frame, index in enumerate(next(iter(pairs.values()))):
         parts = {}
         for name, chosen in pairs.items():
-            depth_file, mask_file = files[name][chosen[frame]]
-            parts[name] = _camera_cloud(rig, name, depth_file, mask_file, last)
+            parts[name] = _camera_cloud(rig, name, files[name][chosen[frame]], last)
         if frame == 0:
-            _check_swapped(folder, rig, parts)
-        cloud = clean(np.concatenate(list(parts.values())), rig.clean, frame)
+            _check_swapped(folder, rig, {name: part.points for name, part in parts.items()})
+        with naming(f"{folder}: frame {index} at {clock[index]:g} s"):
+            points = _cloth(list(parts.values()), float(clock[index]), segmenter)
+        cloud = clean(points, rig.clean, frame)
         if len(cloud) == 0:
             raise ValueError(
                 f"{folder}: frame {index} at {clock[index]:g} s: no point is left in the workspace "
                 f"{rig.clean.workspace} [m]: check workspace, table and masks, or drop the frame"
             )
         yield float(clock[index]), cloud
+    if segmenter is not None:
+        with naming(folder):
+            segmenter.check()
 
 
-def _files(folder: Path, camera: DepthCamera) -> list[tuple[Path, Path | None]]:
-    """The depth image and the mask of each frame of a camera."""
+class _Seen(NamedTuple):
+    """What a camera sees in its workspace: points [m], their colours if asked for; how many are
+    outside; whether a mask was there."""
+
+    points: np.ndarray
+    colours: np.ndarray
+    outside: int
+    masked: bool
+
+
+def _cloth(seen: list[_Seen], time: float, segmenter: Segmenter | None) -> np.ndarray:
+    """The points of the cloth: all behind masks, and what a segmenter keeps of the others."""
+    points = [part.points for part in seen if part.masked or segmenter is None]
+    whole = [part for part in seen if not part.masked]
+    if segmenter is not None and whole:
+        scene, colours = (np.concatenate([part[i] for part in whole]) for i in (0, 1))
+        outside = sum(part.outside for part in whole)
+        points.append(scene[segmenter(scene, time, colours, outside)])
+    return np.concatenate(points)
+
+
+def _files(
+    folder: Path, camera: DepthCamera, coloured: bool
+) -> list[tuple[Path, Path | None, Path | None]]:
+    """The depth image, the mask, and the colour image if it is read, of each frame of a camera."""
     if not folder.is_dir():
         raise FileNotFoundError(
             f"{folder}: no folder of the camera {folder.name!r}, which {NAME} names: "
@@ -233,13 +275,16 @@ def _files(folder: Path, camera: DepthCamera) -> list[tuple[Path, Path | None]]:
         if not (folder / "masks").is_dir():
             raise FileNotFoundError(
                 f"{folder / 'masks'}: no such folder: segment the fabric (SAM 2 writes such "
-                f'masks), or set "masks": false in {NAME}'
+                f'masks), or set "masks": false and give a segmentation in {NAME}'
             )
         masks = find_numbered(folder / "masks", images.MASKS)
         _same_frames(folder, "masks", depths, masks)
-    if (folder / "colour").is_dir():
-        _same_frames(folder, "colour", depths, find_numbered(folder / "colour", images.COLOURS))
-    return [(depths[number], masks[number]) for number in depths]
+    colours: Mapping[int, Path | None] = dict.fromkeys(depths)
+    if (folder / "colour").is_dir() or (coloured and not camera.masks):
+        found = find_numbered(folder / "colour", images.COLOURS)
+        _same_frames(folder, "colour", depths, found)
+        colours = found if coloured and not camera.masks else colours
+    return [(depths[number], masks[number], colours[number]) for number in depths]
 
 
 def _same_frames(folder: Path, kind: str, depths: Mapping[int, Any], others: Mapping) -> None:
@@ -252,10 +297,10 @@ def _same_frames(folder: Path, kind: str, depths: Mapping[int, Any], others: Map
 
 
 def _camera_cloud(
-    rig: Rig, name: str, depth_file: Path, mask_file: Path | None, last: dict[str, bytes]
-) -> Float[np.ndarray, "point 3"]:
-    """World points [m] of the fabric that one camera sees in one frame."""
-    camera = rig.cameras[name]
+    rig: Rig, name: str, files: tuple[Path, Path | None, Path | None], last: dict[str, bytes]
+) -> _Seen:
+    """World points [m] of the fabric, or without a mask of all, that a camera sees in a frame."""
+    camera, (depth_file, mask_file, colour_file) = rig.cameras[name], files
     depth = images.read_depth(depth_file, camera.depth_scale, camera.resolution)
     _warn_of_repeats(name, depth_file, depth, last)
     where = depth > 0
@@ -273,7 +318,11 @@ def _camera_cloud(
             f"workspace {rig.clean.workspace} [m], their median is at "
             f"{np.median(points, axis=0).round(3).tolist()} m: {_remedy(rig, name, seen)}"
         )
-    return points[kept]
+    colours = np.zeros((len(points), 3), np.uint8)
+    if colour_file is not None:
+        colours = images.read_colour(colour_file, camera.resolution)[where]
+    outside = int((~kept).sum())
+    return _Seen(points[kept], colours[kept], outside, mask_file is not None)
 
 
 def _mask(
