@@ -256,8 +256,8 @@ def read_recording(
     if how is not None:
         segmenter = Segmenter(
             *(how, scenario.sheet, scenario.table_height, grippers, knots - scenario.time_offset),
-            to_world=lambda points: to_world(scenario.cloud, points) + np.array(shift),
-            frames=[] if cuts is None else cuts,
+            lambda points: to_world(scenario.cloud, points) + np.array(shift),
+            *(scenario.frames_used, [] if cuts is None else cuts),
         )
         # what is cut off around a gripper was not seen
         views = views and replace(views, hidden=max(views.hidden, how.gripper_radius))

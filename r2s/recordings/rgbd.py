@@ -175,7 +175,8 @@ def rgbd_recording(
     rig, segmenter = rig or read_rig(folder), None
     if rig.segmentation is not None:
         path, knots = np.asarray(gripper_path), np.asarray(gripper_times) - info.time_offset
-        segmenter = Segmenter(rig.segmentation, info.sheet, info.table_height, path, knots)
+        what = rig.segmentation, info.sheet, info.table_height, path, knots
+        segmenter = Segmenter(*what, frames_used=info.frames_used)
     times, clouds = read_clouds(folder, rig, segmenter=segmenter)
     clock = times + info.time_offset
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
@@ -201,9 +202,10 @@ def stream(
 ) -> Iterator[tuple[float, Float[np.ndarray, "point 3"]]]:
     """Time [s] and cleaned cloud [m] of one frame after the other: the images of one are in memory.
 
-    `frame_rate` [Hz] is used where the rig has none; the `segmenter` for cameras without masks,
-    and it must find a sheet. Raises FileNotFoundError, ImportError (names
-    the extra), or ValueError that names the file or camera and frame, and what to do.
+    `frame_rate` [Hz] is used where the rig has none. A `segmenter` cuts the cloth out of what
+    cameras without masks see, and is checked after the last frame. Raises FileNotFoundError,
+    ImportError (names the extra), or ValueError that names the file or camera and frame, and what
+    to do.
     """
     folder = Path(folder)
     if rig.segmentation is not None and segmenter is None:
@@ -222,7 +224,7 @@ def stream(
     for frame, index in enumerate(next(iter(pairs.values()))):
         parts = {}
         for name, chosen in pairs.items():
-            parts[name] = _camera_cloud(rig, name, files[name][chosen[frame]], last)
+            parts[name] = _camera_cloud(rig, name, *files[name][int(chosen[frame])], last)
         if frame == 0:
             _check_swapped(folder, rig, {name: part.points for name, part in parts.items()})
         with naming(f"{folder}: frame {index} at {clock[index]:g} s"):
@@ -240,8 +242,7 @@ def stream(
 
 
 class _Seen(NamedTuple):
-    """What a camera sees in its workspace: points [m], their colours if asked for; how many are
-    outside; whether a mask was there."""
+    """Points [m] of a camera in the workspace, colours if asked for, and how many are outside."""
 
     points: np.ndarray
     colours: np.ndarray
@@ -297,10 +298,15 @@ def _same_frames(folder: Path, kind: str, depths: Mapping[int, Any], others: Map
 
 
 def _camera_cloud(
-    rig: Rig, name: str, files: tuple[Path, Path | None, Path | None], last: dict[str, bytes]
+    rig: Rig,
+    name: str,
+    depth_file: Path,
+    mask_file: Path | None,
+    colour_file: Path | None,
+    last: dict[str, bytes],
 ) -> _Seen:
     """World points [m] of the fabric, or without a mask of all, that a camera sees in a frame."""
-    camera, (depth_file, mask_file, colour_file) = rig.cameras[name], files
+    camera = rig.cameras[name]
     depth = images.read_depth(depth_file, camera.depth_scale, camera.resolution)
     _warn_of_repeats(name, depth_file, depth, last)
     where = depth > 0

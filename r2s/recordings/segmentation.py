@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from r2s._util.checks import expect
 from r2s._util.extras import require
-from r2s.recordings.clouds import Corner, draw_points, voxel_means
+from r2s.recordings.clouds import Corner, draw_points, read_values, voxel_means
 from r2s.recordings.recording import CORNERS, SheetPlacement, corner, interpolated
 
 FATES = ("outside", "table", "other colour", "gripper", "arm", "other pieces", "cloth")
@@ -116,6 +116,7 @@ class Segmenter:
 
     - `gripper_path` [m], `gripper_times` [s]: as in `make_recording`, on the clock of the frames.
     - `to_world`: from the points as they are given to the world, [m].
+    - `frames_used`: the first and the last that must show a sheet; None: all.
     - `table`: its plane, once it is fitted: normal, up, and minus the distance from 0 [m].
     """
 
@@ -125,6 +126,7 @@ class Segmenter:
     gripper_path: Float[np.ndarray, "knot ..."]
     gripper_times: Float[np.ndarray, " knot"]
     to_world: Callable[[np.ndarray], np.ndarray] = np.asarray
+    frames_used: tuple[int, int] | None = None
     frames: list[FrameCuts] = field(default_factory=list)
     table: Float[np.ndarray, "4"] | None = None
 
@@ -142,7 +144,7 @@ class Segmenter:
     ) -> Which:
         """Which points of a frame are of the cloth; `outside` others were dropped before.
 
-        Raises ValueError where none is.
+        Raises ValueError where none is, or a cut cannot be made.
         """
         world, path = self.to_world(points), (self.gripper_times, self.gripper_path)
         grippers = interpolated(np.array([time]), *path).reshape(-1, 3)
@@ -150,10 +152,16 @@ class Segmenter:
         for fate, is_cut in self._cuts(world, colours, grippers):
             fates[(fates == len(FATES) - 1) & is_cut] = FATES.index(fate)
         left = np.flatnonzero(fates == len(FATES) - 1)
-        fates[left[~held_piece(world[left], grippers, self.how)]] = FATES.index("other pieces")
-        is_cloth = fates == len(FATES) - 1
+        held = held_piece(world[left], grippers, self.how)
+        if held.any() or self._is_used(len(self.frames)):
+            fates[left[~held]] = FATES.index("other pieces")
         counts = np.bincount(fates, minlength=len(FATES))
         counts[0] += outside
+        some = draw_points(np.column_stack([world, fates]), DRAWN, (0, len(self.frames)))
+        drawn = some[:, :3], some[:, 3].astype(int), grippers
+        is_cloth = fates == len(FATES) - 1
+        extent = _extent(world[is_cloth], grippers, self.sheet) if is_cloth.any() else (0.0, 0.0)
+        self.frames.append(FrameCuts(time, counts, *drawn, *extent))
         if not is_cloth.any():
             away = np.min(np.linalg.norm(world[left, None] - grippers, axis=-1), initial=np.inf)
             raise ValueError(
@@ -161,11 +169,11 @@ class Segmenter:
                 f"gripper, touch is {self.how.touch:g} m: widen what cuts most, check that path "
                 "and frames have one clock and one world, or give masks"
             )
-        some = draw_points(np.column_stack([world, fates]), DRAWN, (0, len(self.frames)))
-        drawn = some[:, :3], some[:, 3].astype(int), grippers
-        extent = _extent(world[is_cloth], grippers, self.sheet)
-        self.frames.append(FrameCuts(time, counts, *drawn, *extent))
         return is_cloth
+
+    def _is_used(self, frame: int) -> bool:
+        first, last = self.frames_used or (0, frame)
+        return first <= frame <= last
 
     def _cuts(self, world: Points, colours: Any, grippers: Grippers) -> Iterator[tuple[str, Which]]:
         """Which points each cut takes."""
@@ -198,19 +206,19 @@ class Segmenter:
 
     def check(self) -> None:
         """Raise ValueError where what was left of a frame is no sheet of the stated size."""
-        side = " x ".join(f"{length:g}" for length in self.sheet.size)
-        few = np.mean([frame.area < LEAST_AREA for frame in self.frames] or [False]) <= FEW
-        for number, frame in enumerate(self.frames):
+        used = [(n, frame) for n, frame in enumerate(self.frames) if self._is_used(n)]
+        few = np.mean([frame.area < LEAST_AREA for _, frame in used] or [0]) <= FEW
+        for number, frame in used:
             remedy = "narrow the workspace, give the colour, gripper_radius, arms, a smaller link"
-            if max(frame.area / MOST_AREA, frame.reach / FARTHEST) <= 1:
+            if frame.area <= MOST_AREA and frame.reach <= FARTHEST:
                 remedy = "widen what cuts most, give sparse points a greater link, a sheet near the"
                 remedy += " table its colour"
                 if few or frame.area >= LEAST_AREA:
                     continue
             raise ValueError(
-                f"frame {number} at {frame.time:g} s: what is left covers {frame.area:.0%} of a "
-                f"sheet of {side} m, and goes {frame.reach:.2f} times as far from a gripper "
-                f"({shares(frame.counts)}): {remedy}, or masks"
+                f"frame {number} at {frame.time:g} s: what is left covers {frame.area:.0%} of the "
+                f"sheet of {self.sheet.size} m, and goes {frame.reach:.2f} times as far from a "
+                f"gripper ({shares(frame.counts)}): {remedy}, or masks"
             )
 
 
@@ -299,4 +307,5 @@ def read_colours(path: Path) -> Colours:
             "the points have no colours: write ply or pcd with red, green and blue, or leave out "
             "the colour of the segmentation"
         )
-    return np.asarray(colours)[:, :3].astype(np.uint8)
+    has_return = np.isfinite(read_values(path)).any(axis=1)  # the others are no points
+    return np.asarray(colours)[has_return, :3].astype(np.uint8)

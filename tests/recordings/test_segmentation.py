@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 import whole_scene as scenes
-from pypcd4 import PointCloud
+from pypcd4.pypcd4 import PointCloud
 from whole_scene import BEIGE, BLUE, GREEN, ORANGE, RED, SIDE
 
 from r2s._util.files import parse, write_json
@@ -174,6 +174,17 @@ def test_frames_that_hide_the_cloth_are_few() -> None:
         cutter.check()
 
 
+def test_frames_that_are_not_used_may_show_no_sheet() -> None:
+    """Such as those in which the gripper goes away; their points are kept as far as may be."""
+    cutter = segmenter(frames_used=(0, 1))
+    for points in (POINTS, POINTS, CLOTH + [0, 0, 0.4]):
+        is_cloth = cutter(points, 0.5)
+    cutter.check()
+    assert is_cloth.mean() > 0.5
+    with pytest.raises(ValueError, match="no cloth is left"):
+        segmenter()(np.concatenate([TABLE, CLOTH - [0, 0, 0.08]]), 0.5)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -214,6 +225,16 @@ def meshed_ply(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
 def test_colours_of_clouds_are_read(tmp_path: Path, write, suffix: str) -> None:
     write(tmp_path / f"0.{suffix}", POINTS, COLOURS)
     np.testing.assert_array_equal(read_colours(tmp_path / f"0.{suffix}"), COLOURS)
+    points = np.where(np.arange(len(POINTS))[:, None] % 5 == 0, np.nan, POINTS)  # nothing measured
+    write(tmp_path / f"1.{suffix}", points, COLOURS)
+    kept = COLOURS[np.arange(len(POINTS)) % 5 > 0]
+    np.testing.assert_array_equal(read_colours(tmp_path / f"1.{suffix}"), kept)
+
+
+def test_as_many_colours_as_points_are_needed() -> None:
+    how = replace(CUTS, colour=((200, 0.3, 0.2), (250, 1, 1)))
+    with pytest.raises(ValueError, match=f"5 colours of {len(POINTS)} points"):
+        segmenter(how)(POINTS, 0.5, COLOURS[:5])
 
 
 @pytest.mark.parametrize("kind", ["points", "mesh", "npy"])
