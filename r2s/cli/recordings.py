@@ -150,8 +150,10 @@ class Convert:
 
     def run(self) -> None:
         from r2s.recordings.open import convert
+        from r2s.viewer.cuts import draw_cuts
 
-        for line in convert(self.folder, self.to, self.only, self.force, self.plot):
+        draw = draw_cuts if self.plot else None
+        for line in convert(self.folder, self.to, self.only, self.force, draw):
             print(line)
 
 

@@ -254,11 +254,13 @@ def read_recording(
             views = shifted(views, shift)
     segmenter, how = None, _segmentation(folder / name, scenario)
     if how is not None:
-        segmenter = Segmenter(
-            *(how, scenario.sheet, scenario.table_height, grippers, knots - scenario.time_offset),
-            lambda points: to_world(scenario.cloud, points) + np.array(shift),
-            *(scenario.frames_used, [] if cuts is None else cuts),
-        )
+        clock = knots - scenario.time_offset  # that of the frames
+        with naming(folder / name):
+            segmenter = Segmenter(
+                *(how, scenario.sheet, scenario.table_height, grippers, clock),
+                lambda points: to_world(scenario.cloud, points) + np.array(shift),
+                *(scenario.frames_used, [] if cuts is None else cuts),
+            )
         # what is cut off around a gripper was not seen
         views = views and replace(views, hidden=max(views.hidden, how.gripper_radius))
     if find_rig(folder / name):

@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,8 @@ from r2s.recordings.manifest import (
 from r2s.recordings.recording import FORMAT, Recording, load, save
 from r2s.recordings.segmentation import FrameCuts, shares
 from r2s.recordings.swings import is_swing, read_swing
+
+Draw = Callable[[Path, str, list[FrameCuts]], None]  # a file, a title, what to draw
 
 
 @dataclass(frozen=True)
@@ -94,16 +96,20 @@ def load_trajectory(path: Path | str) -> SimulatedCloth:
 
 
 def convert(
-    folder: Path | str, to: Path | str, only: str = "", force: bool = False, plot: bool = False
+    folder: Path | str,
+    to: Path | str,
+    only: str = "",
+    force: bool = False,
+    draw: Draw | None = None,
 ) -> Iterator[str]:
     """Write `to`/NAME.npz for each recording in a folder; says what it does, line by line.
 
     `folder` holds recordings, or is one of them; `only` is a regular expression for names. Beside
     each NPZ lies NAME.sha256, of the files that it was made from: one that they still have is up to
-    date, and skipped unless `force`. `plot` draws NAME_cuts.png: what a segmentation cut off. A run
-    that was killed continues where it was. Raises ValueError or OSError: no such recordings; and,
-    after all the others were converted, one for all recordings that could not be read, with file
-    and frame.
+    date, and skipped unless `force`. A run that was killed continues where it was. `draw`, such as
+    `r2s.viewer.cuts.draw_cuts`, draws NAME_cuts.png: what a segmentation cut off. Raises ValueError
+    or OSError: no such recordings; and, after all the others were converted, one for all recordings
+    that could not be read, with file and frame.
     """
     root, names = _names(Path(folder), only)
     manifest, to = manifest_for(root), Path(to)
@@ -112,7 +118,7 @@ def convert(
     for number, name in enumerate(names, 1):
         try:
             label = f"{name} ({number} of {len(names)})"
-            yield f"{name}: {_convert_one(root, manifest, name, to, force, label, plot)}"
+            yield f"{name}: {_convert_one(root, manifest, name, to, force, label, draw)}"
         except (ValueError, OSError) as error:
             problems.append(str(error))
     if problems:
@@ -143,7 +149,13 @@ def _names(folder: Path, only: str) -> tuple[Path, list[str]]:
 
 
 def _convert_one(
-    root: Path, manifest: Manifest, name: str, to: Path, force: bool, label: str, plot: bool
+    root: Path,
+    manifest: Manifest,
+    name: str,
+    to: Path,
+    force: bool,
+    label: str,
+    draw: Draw | None,
 ) -> str:
     file, mark = to / f"{name}.npz", to / f"{name}.sha256"
     total = hashlib.sha256(FORMAT.encode())
@@ -163,10 +175,8 @@ def _convert_one(
     try:
         recording = read_recording(root, manifest, name, bar, cuts)
     finally:  # it also shows why a recording is refused
-        if plot and cuts:
-            from r2s.viewer.cuts import draw_cuts
-
-            draw_cuts(to / f"{name}_cuts.png", name, cuts)
+        if draw is not None and cuts:
+            draw(to / f"{name}_cuts.png", name, cuts)
     save(recording, file)
     write_text(mark, made_from + "\n")
     done = f"{len(recording.times)} frames, {int(recording.mask.sum())} points, {file}"

@@ -32,6 +32,7 @@ def draw_cuts(path: Path, title: str, frames: Sequence[FrameCuts]) -> None:
         axes.scatter(*frame.grippers.T, s=20, color="#000000", marker="x", label="place of gripper")
         axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
         axes.locator_params(nbins=5)
+        axes.patch.set_visible(False)  # it would cover the labels of the panel to the left
         axes.set_title(f"frame {number}, {frame.time:.2f} s", fontsize=9)
     entries = figure.axes[0].get_legend_handles_labels()
     figure.legend(*entries, loc="outside lower center", ncols=8, fontsize=8, markerscale=2)

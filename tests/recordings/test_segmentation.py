@@ -31,6 +31,7 @@ from r2s.recordings.segmentation import (
     in_colour,
     read_colours,
 )
+from r2s.viewer.cuts import draw_cuts
 
 UP = (0.0, 0.0, 1.0)
 BOX = ((-0.3, -0.3, -0.05), (0.7, 0.7, 0.9))
@@ -282,7 +283,7 @@ def test_a_folder_of_coloured_clouds_is_converted(tmp_path: Path) -> None:
     (folder / "fling_blue").mkdir()
     for frame in range(2):
         coloured_ply(folder / "fling_blue" / f"{frame}.ply", POINTS, COLOURS)
-    (line,) = convert(folder, tmp_path / "out", plot=True)
+    (line,) = convert(folder, tmp_path / "out", draw=draw_cuts)
     assert "cuts: table" in line and "other colour" in line and "cloth" in line
     assert (tmp_path / "out" / "fling_blue_cuts.png").stat().st_size > 10_000
     made = cloud(load(tmp_path / "out" / "fling_blue.npz"), 1)
