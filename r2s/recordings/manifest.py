@@ -252,17 +252,8 @@ def read_recording(
             box = session.workspace or views.clean.workspace
             views = replace(views, clean=replace(views.clean, workspace=box))
             views = shifted(views, shift)
-    segmenter, how = None, _segmentation(folder / name, scenario)
-    if how is not None:
-        clock = knots - scenario.time_offset  # that of the frames
-        with naming(folder / name):
-            segmenter = Segmenter(
-                *(how, scenario.sheet, scenario.table_height, grippers, clock),
-                lambda points: to_world(scenario.cloud, points) + np.array(shift),
-                *(scenario.frames_used, [] if cuts is None else cuts),
-            )
-        # what is cut off around a gripper was not seen
-        views = views and replace(views, hidden=max(views.hidden, how.gripper_radius))
+    clock = knots - scenario.time_offset  # that of the frames
+    segmenter = _segmenter(folder / name, scenario, shift, grippers, clock, cuts)
     if find_rig(folder / name):
         rig = read_rig(folder / name)
         times, clouds = read_clouds(folder / name, rig, scenario.frame_rate, watch, segmenter)
@@ -277,6 +268,8 @@ def read_recording(
             clouds = _cut_out(segmenter, frames, times, clouds)
         if scenario.drop_repeats:
             clouds = [_distinct(points) for points in clouds]
+    if views is not None and segmenter is not None and segmenter.frames:  # cut off is not seen
+        views = replace(views, hidden=max(views.hidden, segmenter.how.gripper_radius))
     source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
     info = RecordingInfo(
         name=name,
@@ -296,6 +289,24 @@ def read_recording(
         [to_world(scenario.cloud, points) + np.array(shift) for points in clouds],
         times + scenario.time_offset,
         *(grippers, knots, info),
+    )
+
+
+def _segmenter(
+    folder: Path,
+    scenario: Scenario,
+    shift: Vector,
+    gripper_path: np.ndarray,
+    gripper_times: np.ndarray,
+    cuts: list[FrameCuts] | None,
+) -> Segmenter | None:
+    """What cuts the cloth of a recording out of its frames; None: all points are of the cloth."""
+    if (how := _segmentation(folder, scenario)) is None:
+        return None
+    return Segmenter(
+        *(how, scenario.sheet, scenario.table_height, gripper_path, gripper_times),
+        lambda points: to_world(scenario.cloud, points) + np.array(shift),
+        *(scenario.frames_used, [] if cuts is None else cuts),
     )
 
 

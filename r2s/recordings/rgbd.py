@@ -176,8 +176,7 @@ def rgbd_recording(
     if rig.segmentation is not None:
         path, knots = np.asarray(gripper_path), np.asarray(gripper_times) - info.time_offset
         what = rig.segmentation, info.sheet, info.table_height, path, knots
-        with naming(folder):
-            segmenter = Segmenter(*what, frames_used=info.frames_used)
+        segmenter = Segmenter(*what, frames_used=info.frames_used)
     times, clouds = read_clouds(folder, rig, segmenter=segmenter)
     clock = times + info.time_offset
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)

@@ -53,6 +53,7 @@ class Arm:
     def __post_init__(self) -> None:
         holds = np.any(self.direction) and self.radius > 0 and self.start < self.end
         expect(holds, f"an arm needs a direction, a radius [m], and end above start: found {self}")
+        expect(min(self.grippers, default=0) >= 0, f"grippers count from 0: {self.grippers}")
 
 
 @dataclass(frozen=True)
@@ -130,15 +131,6 @@ class Segmenter:
     frames: list[FrameCuts] = field(default_factory=list)
     table: Float[np.ndarray, "4"] | None = None
 
-    def __post_init__(self) -> None:
-        heights = np.array([corner(self.sheet, name)[2] for name in CORNERS]) - self.table_height
-        expect(
-            self.how.colour is not None or (np.abs(heights) >= self.how.table_margin).any(),
-            "a sheet that lies on the table is cut off with what is within table_margin of it: "
-            "give its colour, or masks; or, where all frames show it in the air, table_margin 0 "
-            "and a workspace that begins above the table",
-        )
-
     def __call__(
         self, points: Points, time: float, colours: Colours | tuple[()] = (), outside: int = 0
     ) -> Which:
@@ -189,6 +181,7 @@ class Segmenter:
             other = ~in_colour(colours, how.colour)
         if how.table_margin > 0:
             if self.table is None:
+                self._expect_in_air()
                 self.table = fit_table(world, self.table_height)
             height = world @ self.table[:3] + self.table[3]
             yield "table", other & (np.abs(height) <= how.table_margin)
@@ -198,11 +191,22 @@ class Segmenter:
         yield "gripper", (np.linalg.norm(away, axis=-1) <= how.gripper_radius).any(axis=1)
         for arm in how.arms:
             axis = np.array(arm.direction) / np.linalg.norm(arm.direction)
+            known = max(arm.grippers, default=0) < len(grippers)
+            expect(known, f"arm of grippers {arm.grippers}: there are {len(grippers)}, from 0")
             outwards = away[:, list(arm.grippers)] if arm.grippers else away
             along = outwards @ axis
             across = np.linalg.norm(outwards - along[..., None] * axis, axis=-1)
             within = (along >= arm.start) & (along <= arm.end) & (across <= arm.radius)
             yield "arm", within.any(axis=1)
+
+    def _expect_in_air(self) -> None:
+        heights = np.array([corner(self.sheet, name)[2] for name in CORNERS]) - self.table_height
+        expect(
+            self.how.colour is not None or (np.abs(heights) >= self.how.table_margin).any(),
+            "a sheet that lies on the table is cut off with what is within table_margin of it: "
+            "give its colour, or masks; or, where all frames show it in the air, table_margin 0 "
+            "and a workspace that begins above the table",
+        )
 
     def check(self) -> None:
         """Raise ValueError where what was left of a frame is no sheet of the stated size."""

@@ -157,6 +157,7 @@ def test_the_largest_piece_at_a_gripper_is_kept(gap: float, touch: float, expect
         ({}, {"gripper_path": PATH + [0, 0, 1.0]}, "0.610 m from a gripper.*one clock"),
         ({}, {"table_height": 0.4}, "no table within 0.1 m of z = 0.4 m: correct table_height"),
         ({}, {"sheet": LIES}, "lies on the table.*give its colour, or masks"),
+        ({"arms": (Arm(UP, 0.05, 0.5, grippers=(2,)),)}, {}, "grippers .2,.: there are 2, from 0"),
     ],
 )
 def test_what_is_no_sheet_is_refused_with_the_remedy(change, more, words: str) -> None:
@@ -340,7 +341,7 @@ def test_masks_are_used_where_given(images: Path) -> None:
     alone = read_clouds(images, Rig({"c0": views["c0"]}, clean))[1][0]
     assert scenes.shares(both, alone)[0] == 1
     assert len(both) == len(alone) + cutter.frames[0].counts[-1]
-    masked = segmenter(CUT)
+    masked = segmenter(CUT, LIES)  # without masks it would be refused
     read_clouds(images, Rig(seen(masks=True), clean), segmenter=masked)
     assert not masked.frames
 
