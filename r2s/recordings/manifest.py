@@ -253,6 +253,7 @@ def read_recording(
             views = replace(views, clean=replace(views.clean, workspace=box))
             views = shifted(views, shift)
     clock = knots - scenario.time_offset  # that of the frames
+    cuts = [] if cuts is None else cuts
     segmenter = _segmenter(folder / name, scenario, shift, grippers, clock, cuts)
     if find_rig(folder / name):
         rig = read_rig(folder / name)
@@ -268,7 +269,7 @@ def read_recording(
             clouds = _cut_out(segmenter, frames, times, clouds)
         if scenario.drop_repeats:
             clouds = [_distinct(points) for points in clouds]
-    if views is not None and segmenter is not None and segmenter.frames:  # cut off is not seen
+    if views is not None and segmenter is not None and cuts:  # what is cut off is not seen
         views = replace(views, hidden=max(views.hidden, segmenter.how.gripper_radius))
     source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
     info = RecordingInfo(
@@ -293,20 +294,15 @@ def read_recording(
 
 
 def _segmenter(
-    folder: Path,
-    scenario: Scenario,
-    shift: Vector,
-    gripper_path: np.ndarray,
-    gripper_times: np.ndarray,
-    cuts: list[FrameCuts] | None,
+    folder: Path, scenario: Scenario, shift: Vector, path: Any, clock: Any, cuts: Any
 ) -> Segmenter | None:
     """What cuts the cloth of a recording out of its frames; None: all points are of the cloth."""
     if (how := _segmentation(folder, scenario)) is None:
         return None
     return Segmenter(
-        *(how, scenario.sheet, scenario.table_height, gripper_path, gripper_times),
+        *(how, scenario.sheet, scenario.table_height, path, clock),
         lambda points: to_world(scenario.cloud, points) + np.array(shift),
-        *(scenario.frames_used, [] if cuts is None else cuts),
+        *(scenario.frames_used, cuts),
     )
 
 

@@ -149,13 +149,7 @@ def _names(folder: Path, only: str) -> tuple[Path, list[str]]:
 
 
 def _convert_one(
-    root: Path,
-    manifest: Manifest,
-    name: str,
-    to: Path,
-    force: bool,
-    label: str,
-    draw: Draw | None,
+    root: Path, manifest: Manifest, name: str, to: Path, force: bool, label: str, draw: Draw | None
 ) -> str:
     file, mark = to / f"{name}.npz", to / f"{name}.sha256"
     total = hashlib.sha256(FORMAT.encode())

@@ -39,6 +39,7 @@ LONGEST = 5.0  # [s] between frames: above, times are taken for milliseconds or 
 MOST = 0.5  # of the points behind a mask: at least so many are in the workspace
 DISAGREE = 0.005  # [m]: cameras whose clouds are closer than this are not swapped
 COMPARED = 2000  # points of each cloud
+File = Path | None
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -174,9 +175,10 @@ def rgbd_recording(
     """
     rig, segmenter = rig or read_rig(folder), None
     if rig.segmentation is not None:
-        path, knots = np.asarray(gripper_path), np.asarray(gripper_times) - info.time_offset
-        what = rig.segmentation, info.sheet, info.table_height, path, knots
-        segmenter = Segmenter(*what, frames_used=info.frames_used)
+        path = np.asarray(gripper_path, float)
+        knots = np.asarray(gripper_times, float) - info.time_offset
+        used = np.asarray, info.frames_used
+        segmenter = Segmenter(rig.segmentation, info.sheet, info.table_height, path, knots, *used)
     times, clouds = read_clouds(folder, rig, segmenter=segmenter)
     clock = times + info.time_offset
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
@@ -208,12 +210,14 @@ def stream(
     to do.
     """
     folder = Path(folder)
-    if rig.segmentation is not None and segmenter is None:
-        raise ValueError(
-            f"{folder}: its segmentation needs a sheet and grippers: use rgbd_recording"
-        )
-    rate, coloured = rig.frame_rate or frame_rate, segmenter and segmenter.how.colour is not None
-    files = {n: _files(folder / n, camera, bool(coloured)) for n, camera in rig.cameras.items()}
+    masked = all(camera.masks for camera in rig.cameras.values())
+    if rig.segmentation is not None and segmenter is None and not masked:
+        raise ValueError(f"{folder}: a segmentation needs sheet and grippers: use rgbd_recording")
+    rate, coloured = rig.frame_rate or frame_rate, bool(segmenter and segmenter.how.colour)
+    files = {
+        name: _files(folder / name, camera, coloured and not camera.masks)
+        for name, camera in rig.cameras.items()
+    }
     times = {name: frame_times(folder / name, len(files[name]), rate) for name in rig.cameras}
     try:
         pairs = pair(times, rig.pair_tolerance)
@@ -261,9 +265,7 @@ def _cloth(seen: list[_Seen], time: float, segmenter: Segmenter | None) -> np.nd
     return np.concatenate(points)
 
 
-def _files(
-    folder: Path, camera: DepthCamera, coloured: bool
-) -> list[tuple[Path, Path | None, Path | None]]:
+def _files(folder: Path, camera: DepthCamera, coloured: bool) -> list[tuple[Path, File, File]]:
     """The depth image, the mask, and the colour image if it is read, of each frame of a camera."""
     if not folder.is_dir():
         raise FileNotFoundError(
@@ -271,7 +273,7 @@ def _files(
             "restore it, or take the camera out"
         )
     depths = find_numbered(folder / "depth", images.DEPTHS)
-    masks: Mapping[int, Path | None] = dict.fromkeys(depths)
+    masks: Mapping[int, File] = dict.fromkeys(depths)
     if camera.masks:
         if not (folder / "masks").is_dir():
             raise FileNotFoundError(
@@ -280,11 +282,11 @@ def _files(
             )
         masks = find_numbered(folder / "masks", images.MASKS)
         _same_frames(folder, "masks", depths, masks)
-    colours: Mapping[int, Path | None] = dict.fromkeys(depths)
-    if (folder / "colour").is_dir() or (coloured and not camera.masks):
-        found = find_numbered(folder / "colour", images.COLOURS)
-        _same_frames(folder, "colour", depths, found)
-        colours = found if coloured and not camera.masks else colours
+    colours: Mapping[int, File] = dict.fromkeys(depths)
+    if (folder / "colour").is_dir() or coloured:
+        colours = find_numbered(folder / "colour", images.COLOURS)
+        _same_frames(folder, "colour", depths, colours)
+    colours = colours if coloured else dict.fromkeys(depths)
     return [(depths[number], masks[number], colours[number]) for number in depths]
 
 
@@ -301,8 +303,8 @@ def _camera_cloud(
     rig: Rig,
     name: str,
     depth_file: Path,
-    mask_file: Path | None,
-    colour_file: Path | None,
+    mask_file: File,
+    colour_file: File,
     last: dict[str, bytes],
 ) -> _Seen:
     """World points [m] of the fabric, or without a mask of all, that a camera sees in a frame."""
@@ -327,8 +329,7 @@ def _camera_cloud(
     colours = np.zeros((len(points), 3), np.uint8)
     if colour_file is not None:
         colours = images.read_colour(colour_file, camera.resolution)[where]
-    outside = int((~kept).sum())
-    return _Seen(points[kept], colours[kept], outside, mask_file is not None)
+    return _Seen(points[kept], colours[kept], int((~kept).sum()), mask_file is not None)
 
 
 def _mask(

@@ -30,7 +30,7 @@ LEAST_AREA, MOST_AREA, FEW = 0.15, 1.15, 0.1  # seen, of the sheet's; share of f
 FARTHEST, STRAY = 1.15, 0.005  # of how far the sheet reaches; share of points that may be farther
 DRAWN = 4000  # points of a frame, for a picture
 Points = Float[np.ndarray, "point 3"]
-Colours = UInt8[np.ndarray, "point 3"]  # red, green, blue
+Colours = UInt8[np.ndarray, "colour 3"]  # red, green, blue
 Which = Bool[np.ndarray, " point"]
 Grippers = Float[np.ndarray, "gripper 3"]
 
@@ -149,8 +149,8 @@ class Segmenter:
             fates[left[~held]] = FATES.index("other pieces")
         counts = np.bincount(fates, minlength=len(FATES))
         counts[0] += outside
-        some = draw_points(np.column_stack([world, fates]), DRAWN, (0, len(self.frames)))
-        drawn = some[:, :3], some[:, 3].astype(int), grippers
+        some = np.random.default_rng(0).permutation(len(points))[:DRAWN]
+        drawn = world[some], fates[some], grippers
         is_cloth = fates == len(FATES) - 1
         extent = _extent(world[is_cloth], grippers, self.sheet) if is_cloth.any() else (0.0, 0.0)
         self.frames.append(FrameCuts(time, counts, *drawn, *extent))
@@ -174,10 +174,8 @@ class Segmenter:
             low, high = np.array(how.workspace)
             yield "outside", ((world < low) | (world > high)).any(axis=1)
         if how.colour is not None:
-            count = len(colours)
-            expect(
-                count == len(world), f"{count} colours of {len(world)} points: export both again"
-            )
+            counts = f"{len(colours)} colours of {len(world)} points"
+            expect(len(colours) == len(world), f"{counts}: export both again")
             other = ~in_colour(colours, how.colour)
         if how.table_margin > 0:
             if self.table is None:

@@ -18,9 +18,8 @@ COLOURS = ("#cccccc", "#8c8c8c", "#F0E442", "#000000", "#56B4E9", "#CC79A7", "#D
 def draw_cuts(path: Path, title: str, frames: Sequence[FrameCuts]) -> None:
     """Write a PNG of the first, middle and last frame: points in the colour of what became of them,
     but for those outside of the workspace, and the shares in all frames. OSError names the file."""
-    figures = require("matplotlib.figure", "study", "--plot")
-    figure = figures.Figure((12.6, 4.6), layout="constrained")
-    figure.get_layout_engine().set(rect=(0, 0, 0.97, 1))  # labels of z stick out
+    figure = require("matplotlib.figure", "study", "--plot").Figure((12.6, 4.6))
+    figure.subplots_adjust(0.0, 0.12, 0.96, 0.9, 0.1)
     total = np.sum([frame.counts for frame in frames], axis=0)
     for panel, number in enumerate((0, (len(frames) - 1) // 2, len(frames) - 1)):
         frame, dots = frames[number], {"linewidths": 0, "depthshade": False}
@@ -35,7 +34,7 @@ def draw_cuts(path: Path, title: str, frames: Sequence[FrameCuts]) -> None:
         axes.patch.set_visible(False)  # it would cover the labels of the panel to the left
         axes.set_title(f"frame {number}, {frame.time:.2f} s", fontsize=9)
     entries = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*entries, loc="outside lower center", ncols=8, fontsize=8, markerscale=2)
+    figure.legend(*entries, loc="lower center", ncols=8, fontsize=8, markerscale=2)
     figure.suptitle(title, fontsize=11)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")

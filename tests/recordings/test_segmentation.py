@@ -31,9 +31,11 @@ from r2s.recordings.segmentation import (
     in_colour,
     read_colours,
 )
+from r2s.recordings.views import Views
 from r2s.viewer.cuts import draw_cuts
 
 UP = (0.0, 0.0, 1.0)
+BLUES = ((200.0, 0.3, 0.1), (255.0, 1.0, 1.0))
 BOX = ((-0.3, -0.3, -0.05), (0.7, 0.7, 0.9))
 HANGS = SheetPlacement((SIDE, SIDE), (0.0, 0.2, 0.1), (1.0, 0.0, 0.0), UP, ("weft", "opposite"))
 LIES = SheetPlacement((SIDE, SIDE), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), ("origin",))
@@ -86,9 +88,9 @@ def test_each_cut_takes_its_own_and_the_cloth_is_left() -> None:
 @pytest.mark.parametrize(
     "how",
     [
-        replace(CUTS, colour=((200, 0.3, 0.2), (250, 1, 1)), arms=(), table_margin=0.0),
-        replace(CUTS, workspace=((-1, 0.1, -1), (1, 0.3, 1)), table_margin=0.02),
-        replace(CUTS, workspace=((-1, -1, 0.05), (1, 1, 0.5)), table_margin=0.0, arms=()),
+        replace(CUTS, colour=BLUES, arms=(), table_margin=0.0),
+        replace(CUTS, workspace=((-1.0, 0.1, -1.0), (1.0, 0.3, 1.0)), table_margin=0.02),
+        replace(CUTS, workspace=((-1.0, -1.0, 0.05), (1.0, 1.0, 0.5)), table_margin=0.0, arms=()),
         replace(CUTS, arms=tuple(Arm(UP, 0.05, 0.5, 0.01, (i,)) for i in (0, 1))),
     ],
     ids=["colour", "workspace", "workspace instead of table and arms", "an arm each"],
@@ -118,11 +120,11 @@ def test_the_plane_of_the_table_is_found_among_other_things(tilt: float) -> None
 @pytest.mark.parametrize(
     ("limits", "inside"),
     [
-        (((340, 0.5, 0.2), (15, 1, 1)), [True, False, False, False, False]),  # around 0
-        (((200, 0.3, 0.2), (250, 1, 1)), [False, True, False, False, False]),
-        (((0, 0, 0.8), (360, 0.1, 1)), [False, False, True, False, False]),  # any hue
-        (((0, 0, 0), (360, 1, 0.2)), [False, False, False, True, False]),
-        (((0, 1, 1), (0, 1, 1)), [False, False, False, False, True]),  # inclusive
+        (((340.0, 0.5, 0.2), (15.0, 1.0, 1.0)), [True, False, False, False, False]),  # around 0
+        (((200.0, 0.3, 0.2), (250.0, 1.0, 1.0)), [False, True, False, False, False]),
+        (((0.0, 0.0, 0.8), (360.0, 0.1, 1.0)), [False, False, True, False, False]),  # any hue
+        (((0.0, 0.0, 0.0), (360.0, 1.0, 0.2)), [False, False, False, True, False]),
+        (((0.0, 1.0, 1.0), (0.0, 1.0, 1.0)), [False, False, False, False, True]),  # inclusive
     ],
 )
 def test_colours_are_within_limits(limits: Any, inside: list[bool]) -> None:
@@ -150,10 +152,18 @@ def test_the_largest_piece_at_a_gripper_is_kept(gap: float, touch: float, expect
     [
         ({"arms": (), "gripper_radius": 0.0}, {}, "covers 12.%.*gripper_radius, arms, .*or masks"),
         ({"table_margin": 0.0, "link": 0.12}, {}, "covers .*narrow the workspace"),
-        ({"workspace": ((-1, -1, 0.45), (1, 1, 1))}, {}, "covers 1.%.*widen what cuts most"),
+        (
+            {"workspace": ((-1.0, -1.0, 0.45), (1.0, 1.0, 1.0))},
+            {},
+            "covers 1.%.*widen what cuts most",
+        ),
         ({"link": 0.004}, {}, "covers 0%.*sparse points a greater link"),
-        ({"workspace": ((5, 5, 5), (6, 6, 6)), "table_margin": 0.0}, {}, "left .outside 100"),
-        ({"colour": ((100, 0.5, 0.5), (140, 1, 1))}, {}, "no cloth is left .*other colour"),
+        (
+            {"workspace": ((5.0, 5.0, 5.0), (6.0, 6.0, 6.0)), "table_margin": 0.0},
+            {},
+            "left .outside 100",
+        ),
+        ({"colour": ((100.0, 0.5, 0.5), (140.0, 1.0, 1.0))}, {}, "no cloth is left .*other colour"),
         ({}, {"gripper_path": PATH + [0, 0, 1.0]}, "0.610 m from a gripper.*one clock"),
         ({}, {"table_height": 0.4}, "no table within 0.1 m of z = 0.4 m: correct table_height"),
         ({}, {"sheet": LIES}, "lies on the table.*give its colour, or masks"),
@@ -234,7 +244,7 @@ def test_colours_of_clouds_are_read(tmp_path: Path, write, suffix: str) -> None:
 
 
 def test_as_many_colours_as_points_are_needed() -> None:
-    how = replace(CUTS, colour=((200, 0.3, 0.2), (250, 1, 1)))
+    how = replace(CUTS, colour=BLUES)
     with pytest.raises(ValueError, match=f"5 colours of {len(POINTS)} points"):
         segmenter(how)(POINTS, 0.5, COLOURS[:5])
 
@@ -279,20 +289,37 @@ def manifest(folder: Path, how: Segmentation | None, **changes: Any) -> Path:
 
 
 def test_a_folder_of_coloured_clouds_is_converted(tmp_path: Path) -> None:
-    how = replace(CUTS, colour=((200, 0.3, 0.2), (250, 1, 1)))
-    folder = manifest(tmp_path / "in", how)
+    how = replace(CUTS, colour=BLUES)
+    views = Views(tuple(seen().values()), Cleaning(BOX))
+    folder = manifest(tmp_path / "in", how, views=asdict(views))
     (folder / "fling_blue").mkdir()
     for frame in range(2):
         coloured_ply(folder / "fling_blue" / f"{frame}.ply", POINTS, COLOURS)
-    (line,) = convert(folder, tmp_path / "out", draw=draw_cuts)
+    drawn: list[Any] = []
+    (line,) = convert(folder, tmp_path / "out", draw=lambda *what: drawn.append(what))
     assert "cuts: table" in line and "other colour" in line and "cloth" in line
-    assert (tmp_path / "out" / "fling_blue_cuts.png").stat().st_size > 10_000
-    made = cloud(load(tmp_path / "out" / "fling_blue.npz"), 1)
+    ((path, title, frames),) = drawn
+    assert path == tmp_path / "out" / "fling_blue_cuts.png" and title == "fling_blue"
+    assert len(frames) == 2
+    recording = load(tmp_path / "out" / "fling_blue.npz")
+    made, views = cloud(recording, 1), recording.info.views
+    assert views is not None and views.hidden == CUTS.gripper_radius
     np.testing.assert_allclose(made.mean(axis=0), CLOTH.mean(axis=0), atol=2e-3)
     assert abs(len(made) - len(CLOTH)) < 0.02 * len(CLOTH)
     np.save(folder / "fling_gripper.npy", PATH + 1.0)
     with pytest.raises(ValueError, match="fling_blue/0.ply: no cloth is left"):
-        list(convert(folder, tmp_path / "out"))
+        list(convert(folder, tmp_path / "out", draw=lambda *what: drawn.append(what)))
+    assert drawn[1][2][0].counts[-1] == 0  # which shows why it is refused
+
+
+def test_cuts_are_drawn(tmp_path: Path) -> None:
+    cutter = segmenter()
+    cutter(POINTS[::10], 0.5, outside=3)
+    draw_cuts(tmp_path / "cuts.png", "a scene", cutter.frames)
+    picture = np.asarray(cv2.imread(str(tmp_path / "cuts.png")))
+    assert picture.shape == (460, 1260, 3)
+    for shade in ((213, 94, 0), (140, 140, 140)):  # of the cloth and the table
+        assert (np.abs(picture[..., ::-1].astype(int) - shade).max(axis=2) < 12).sum() > 100
 
 
 @pytest.fixture(scope="module")
@@ -316,15 +343,15 @@ INFO = RecordingInfo("s", "fling", "blue", "1", "made up", (0, 1), HANGS, 0.0, N
 
 @pytest.mark.parametrize(
     "how",
-    [CUT, replace(CUT, colour=((200, 0.3, 0.1), (255, 1, 1)), table_margin=0.0)],
+    [CUT, replace(CUT, colour=BLUES, table_margin=0.0)],
     ids=["geometry", "colour"],
 )
 def test_images_without_masks_give_the_cloth(images: Path, how: Segmentation) -> None:
-    rig = Rig(seen(), Cleaning(BOX, voxel=0, neighbours=0), segmentation=how)
+    rig = Rig(seen(), Cleaning(BOX, voxel=0.0, neighbours=0), segmentation=how)
     path = PATH, np.array([0.0, 1.0])
     made = rgbd_recording(images, INFO, *path, rig=rig)
     true = read_clouds(images, replace(rig, cameras=seen(masks=True), segmentation=None))[1]
-    with pytest.raises(ValueError, match="segmentation needs a sheet and grippers"):
+    with pytest.raises(ValueError, match="segmentation needs sheet and grippers"):
         read_clouds(images, rig)
     for frame in range(2):
         points = np.asarray(cloud(made, frame), np.float32)
@@ -334,7 +361,7 @@ def test_images_without_masks_give_the_cloth(images: Path, how: Segmentation) ->
 
 def test_masks_are_used_where_given(images: Path) -> None:
     """One camera has masks, another none: cuts are made in what the second sees."""
-    clean, views = Cleaning(BOX, voxel=0, neighbours=0), seen()
+    clean, views = Cleaning(BOX, voxel=0.0, neighbours=0), seen()
     views["c0"] = replace(views["c0"], masks=True)
     cutter = segmenter(CUT)
     both = read_clouds(images, Rig(views, clean), segmenter=cutter)[1][0]
@@ -349,8 +376,7 @@ def test_masks_are_used_where_given(images: Path) -> None:
 def test_a_changed_colour_image_is_converted_again_where_it_is_read(
     images: Path, tmp_path: Path
 ) -> None:
-    colour = ((200, 0.3, 0.1), (255, 1, 1))
-    folder = manifest(tmp_path / "in", replace(CUT, colour=colour))
+    folder = manifest(tmp_path / "in", replace(CUT, colour=BLUES))
     shutil.copytree(images, folder / "fling_blue")
     rig = Rig(seen(), Cleaning(BOX))
     write_json(folder / "fling_blue" / "cameras.json", asdict(rig))
@@ -366,3 +392,5 @@ def test_a_changed_colour_image_is_converted_again_where_it_is_read(
     shutil.rmtree(picture.parent)
     with pytest.raises(ValueError, match="c0/colour: no such folder"):
         next(convert(folder, tmp_path / "out"))
+    write_json(folder / "fling_blue" / "cameras.json", asdict(replace(rig, segmentation=CUT)))
+    assert "cuts: outside" in next(convert(folder, tmp_path / "out"))  # it comes first

@@ -16,8 +16,9 @@ from r2s.recordings.segmentation import Arm, Segmentation, Segmenter
 BOX = ((-0.35, -0.35, -0.05), (0.75, 0.75, 0.9))
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 DARK = (60, 50, 45)
-AS_BLUE, AS_RED = ((200, 0.3, 0.15), (255, 1, 1)), ((340, 0.55, 0.2), (12, 1, 1))
-AS_WHITE = ((0, 0, 0.55), (360, 0.12, 1))
+AS_BLUE = ((200.0, 0.3, 0.15), (255.0, 1.0, 1.0))
+AS_RED = ((340.0, 0.55, 0.2), (12.0, 1.0, 1.0))
+AS_WHITE = ((0.0, 0.0, 0.55), (360.0, 0.12, 1.0))
 LIES = SheetPlacement((SIDE, SIDE), (0.0, 0.0, 0.0), X, Y, ("origin",))
 HANGS = SheetPlacement((SIDE, SIDE), (0.0, SIDE / 2, 0.1), X, Z, ("weft", "opposite"))
 STEEP, BACK = (-0.4, -0.5, 0.75), (0.0, 0.6, 0.8)
@@ -66,7 +67,14 @@ SCENES = {
         {"table_margin": 0.015},
     ),
     "hanging from outstretched arms": (
-        *(HANGS, [scenes.hanging(0.15)] * 2, WHITE, WHITE, [(-1, 0, 0.2), (1, 0, 0.2)], CLUTTER),
+        *(
+            HANGS,
+            [scenes.hanging(0.15)] * 2,
+            WHITE,
+            WHITE,
+            [(-1.0, 0.0, 0.2), (1.0, 0.0, 0.2)],
+            CLUTTER,
+        ),
         *(1.5, {"table_margin": 0.02}),
     ),
     "hanging low": (
@@ -100,7 +108,7 @@ def measured(folder: Path, name: str) -> list[tuple[float, float]]:
         gripper_radius=0.02,
         **cuts,
     )
-    rig = Rig(scenes.cameras(), Cleaning(BOX, voxel=0, neighbours=0))
+    rig = Rig(scenes.cameras(), Cleaning(BOX, voxel=0.0, neighbours=0))
     times = np.arange(len(frames)) / 15
     scenes.write_scene(folder, rig, frames, list(times))
     segmenter = Segmenter(how, place, 0.0, path, times)
