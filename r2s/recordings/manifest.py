@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from r2s._util.checks import naming
 from r2s._util.files import read_json
 from r2s._util.units import positive
 from r2s.recordings.cameras import is_rotation
@@ -300,7 +299,7 @@ def _segmenter(
     if (how := _segmentation(folder, scenario)) is None:
         return None
     return Segmenter(
-        *(how, scenario.sheet, scenario.table_height, path, clock),
+        *(how, scenario.sheet, scenario.table_height, path, clock, str(folder)),
         lambda points: to_world(scenario.cloud, points) + np.array(shift),
         *(scenario.frames_used, cuts),
     )
@@ -310,11 +309,9 @@ def _cut_out(segmenter: Segmenter, files: Sequence[Path], times: Any, clouds: An
     """The clouds of files at times without what is not of the cloth; errors name the file."""
     kept = []
     for file, time, points in zip(files, times, clouds, strict=True):
-        with naming(file):
-            colours = () if segmenter.how.colour is None else read_colours(file)
-            kept.append(points[segmenter(points, float(time), colours)])
-    with naming(files[0].parent):
-        segmenter.check()
+        colours = () if segmenter.how.colour is None else read_colours(file)
+        kept.append(points[segmenter(points, float(time), colours)])
+    segmenter.check()
     return kept
 
 

@@ -25,7 +25,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from r2s._util.checks import naming
 from r2s._util.files import read_json
 from r2s.recordings import images
 from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved
@@ -177,8 +176,8 @@ def rgbd_recording(
     if rig.segmentation is not None:
         path = np.asarray(gripper_path, float)
         knots = np.asarray(gripper_times, float) - info.time_offset
-        used = np.asarray, info.frames_used
-        segmenter = Segmenter(rig.segmentation, info.sheet, info.table_height, path, knots, *used)
+        what = rig.segmentation, info.sheet, info.table_height, path, knots, str(folder)
+        segmenter = Segmenter(*what, frames_used=info.frames_used)
     times, clouds = read_clouds(folder, rig, segmenter=segmenter)
     clock = times + info.time_offset
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
@@ -231,8 +230,7 @@ def stream(
             parts[name] = _camera_cloud(rig, name, *files[name][int(chosen[frame])], last)
         if frame == 0:
             _check_swapped(folder, rig, {name: part.points for name, part in parts.items()})
-        with naming(f"{folder}: frame {index} at {clock[index]:g} s"):
-            points = _cloth(list(parts.values()), float(clock[index]), segmenter)
+        points = _cloth(list(parts.values()), float(clock[index]), segmenter)
         cloud = clean(points, rig.clean, frame)
         if len(cloud) == 0:
             raise ValueError(
@@ -241,8 +239,7 @@ def stream(
             )
         yield float(clock[index]), cloud
     if segmenter is not None:
-        with naming(folder):
-            segmenter.check()
+        segmenter.check()
 
 
 class _Seen(NamedTuple):

@@ -28,6 +28,11 @@ FLAT, LEAST_TABLE = 0.005, 0.2  # [m] of the plane; share of the points near the
 SIDE = 15  # cells along the side of a square of the sheet's area
 LEAST_AREA, MOST_AREA, FEW = 0.15, 1.15, 0.1  # seen, of the sheet's; share of frames that show less
 FARTHEST, STRAY = 1.15, 0.005  # of how far the sheet reaches; share of points that may be farther
+LYING = (
+    "a sheet that lies on the table is cut off with what is within table_margin of it: give its "
+    "colour, or masks; or, where all frames show it in the air, table_margin 0 and a workspace "
+    "that begins above the table"
+)
 DRAWN = 4000  # points of a frame, for a picture
 Points = Float[np.ndarray, "point 3"]
 Colours = UInt8[np.ndarray, "colour 3"]  # red, green, blue
@@ -117,6 +122,7 @@ class Segmenter:
 
     - `gripper_path` [m], `gripper_times` [s]: as in `make_recording`, on the clock of the frames.
     - `to_world`: from the points as they are given to the world, [m].
+    - `where`: the recording, for errors.
     - `frames_used`: the first and the last that must show a sheet; None: all.
     - `table`: its plane, once it is fitted: normal, up, and minus the distance from 0 [m].
     """
@@ -126,6 +132,7 @@ class Segmenter:
     table_height: float
     gripper_path: Float[np.ndarray, "knot ..."]
     gripper_times: Float[np.ndarray, " knot"]
+    where: str
     to_world: Callable[[np.ndarray], np.ndarray] = np.asarray
     frames_used: tuple[int, int] | None = None
     frames: list[FrameCuts] = field(default_factory=list)
@@ -134,10 +141,17 @@ class Segmenter:
     def __call__(
         self, points: Points, time: float, colours: Colours | tuple[()] = (), outside: int = 0
     ) -> Which:
-        """Which points of a frame are of the cloth; `outside` others were dropped before.
+        """Which points of the next frame are of the cloth; `outside` others were dropped before.
 
-        Raises ValueError where none is, or a cut cannot be made.
+        Raises ValueError that names it where none is, or a cut cannot be made.
         """
+        where = f"{self.where}: frame {len(self.frames)} at {time:g} s"
+        try:
+            return self._cut(points, time, colours, outside)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from error
+
+    def _cut(self, points: Points, time: float, colours: Any, outside: int) -> Which:
         world, path = self.to_world(points), (self.gripper_times, self.gripper_path)
         grippers = interpolated(np.array([time]), *path).reshape(-1, 3)
         fates = np.full(len(points), len(FATES) - 1)
@@ -179,7 +193,8 @@ class Segmenter:
             other = ~in_colour(colours, how.colour)
         if how.table_margin > 0:
             if self.table is None:
-                self._expect_in_air()
+                ends = [corner(self.sheet, name)[2] - self.table_height for name in CORNERS]
+                expect(how.colour is not None or np.max(np.abs(ends)) >= how.table_margin, LYING)
                 self.table = fit_table(world, self.table_height)
             height = world @ self.table[:3] + self.table[3]
             yield "table", other & (np.abs(height) <= how.table_margin)
@@ -197,15 +212,6 @@ class Segmenter:
             within = (along >= arm.start) & (along <= arm.end) & (across <= arm.radius)
             yield "arm", within.any(axis=1)
 
-    def _expect_in_air(self) -> None:
-        heights = np.array([corner(self.sheet, name)[2] for name in CORNERS]) - self.table_height
-        expect(
-            self.how.colour is not None or (np.abs(heights) >= self.how.table_margin).any(),
-            "a sheet that lies on the table is cut off with what is within table_margin of it: "
-            "give its colour, or masks; or, where all frames show it in the air, table_margin 0 "
-            "and a workspace that begins above the table",
-        )
-
     def check(self) -> None:
         """Raise ValueError where what was left of a frame is no sheet of the stated size."""
         used = [(n, frame) for n, frame in enumerate(self.frames) if self._is_used(n)]
@@ -218,9 +224,9 @@ class Segmenter:
                 if few or frame.area >= LEAST_AREA:
                     continue
             raise ValueError(
-                f"frame {number} at {frame.time:g} s: what is left covers {frame.area:.0%} of the "
-                f"sheet of {self.sheet.size} m, and goes {frame.reach:.2f} times as far from a "
-                f"gripper ({shares(frame.counts)}): {remedy}, or masks"
+                f"{self.where}: frame {number} at {frame.time:g} s: what is left covers "
+                f"{frame.area:.0%} of the sheet of {self.sheet.size} m, and goes {frame.reach:.2f} "
+                f"times as far from a gripper ({shares(frame.counts)}): {remedy}, or masks"
             )
 
 
@@ -294,7 +300,7 @@ def _extent(points: Points, grippers: Grippers, sheet: SheetPlacement) -> tuple[
 
 
 def read_colours(path: Path) -> Colours:
-    """The colours of the points of a ply or pcd file; ValueError where there are none."""
+    """The colours of the points of a ply or pcd file; ValueError that names it without."""
     colours: Any = ()
     if path.suffix.lower() == ".ply":
         trimesh = require("trimesh", "study", f"{path}: clouds in ply files")
@@ -306,8 +312,8 @@ def read_colours(path: Path) -> Colours:
         colours = cloud.decode_rgb(cloud.pc_data[names[0]].copy()) if names else ()
     if not len(colours):
         raise ValueError(
-            "the points have no colours: write ply or pcd with red, green and blue, or leave out "
-            "the colour of the segmentation"
+            f"{path}: its points have no colours: write ply or pcd with red, green and blue, or "
+            "leave out the colour of the segmentation"
         )
     has_return = np.isfinite(read_values(path)).any(axis=1)  # the others are no points
     return np.asarray(colours)[has_return, :3].astype(np.uint8)

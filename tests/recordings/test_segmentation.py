@@ -61,6 +61,7 @@ COLOURS = np.concatenate([np.tile(np.uint8(shade), (len(part), 1)) for part, sha
 
 def segmenter(how: Segmentation = CUTS, sheet: SheetPlacement = HANGS, **more: Any) -> Segmenter:
     fields = {"table_height": 0.0, "gripper_path": PATH, "gripper_times": np.array([0.0, 1.0])}
+    fields["where"] = "here"
     return Segmenter(how, sheet, **(fields | more))
 
 
@@ -307,7 +308,7 @@ def test_a_folder_of_coloured_clouds_is_converted(tmp_path: Path) -> None:
     np.testing.assert_allclose(made.mean(axis=0), CLOTH.mean(axis=0), atol=2e-3)
     assert abs(len(made) - len(CLOTH)) < 0.02 * len(CLOTH)
     np.save(folder / "fling_gripper.npy", PATH + 1.0)
-    with pytest.raises(ValueError, match="fling_blue/0.ply: no cloth is left"):
+    with pytest.raises(ValueError, match="fling_blue: frame 0 at 0 s: no cloth is left"):
         list(convert(folder, tmp_path / "out", draw=lambda *what: drawn.append(what)))
     assert drawn[1][2][0].counts[-1] == 0  # which shows why it is refused
 

@@ -111,7 +111,7 @@ def measured(folder: Path, name: str) -> list[tuple[float, float]]:
     rig = Rig(scenes.cameras(), Cleaning(BOX, voxel=0.0, neighbours=0))
     times = np.arange(len(frames)) / 15
     scenes.write_scene(folder, rig, frames, list(times))
-    segmenter = Segmenter(how, place, 0.0, path, times)
+    segmenter = Segmenter(how, place, 0.0, path, times, name)
     kept = read_clouds(folder, rig, segmenter=segmenter)[1]
     masked = {n: replace(view, masks=True) for n, view in rig.cameras.items()}
     true = read_clouds(folder, replace(rig, cameras=masked))[1]
