@@ -128,11 +128,13 @@ class Convert:
 
     FOLDER has a manifest.json and a folder for each recording, or is the folder of one. Where there
     is a cameras.json, in a recording's folder or above, that holds images, else numbered clouds.
-    What was converted already is skipped, unless the files that it was made from have changed.
+    Where a segmentation is given there, the cloth is cut out of what was seen without masks, and
+    the share of each cut is printed. What was converted already is skipped, unless the files that
+    it was made from have changed.
     Recordings that cannot be read are named, with file and frame, after the others were converted.
 
         r2s data convert recordings --to canonical
-        r2s data convert recordings --only '^lift_' --to canonical
+        r2s data convert recordings --only '^lift_' --to canonical --plot
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
@@ -143,11 +145,15 @@ class Convert:
     """Convert those whose name matches this regular expression."""
     force: bool = False
     """Convert again what is up to date, as after an update of r2s."""
+    plot: bool = False
+    """Draw NAME_cuts.png beside NAME.npz: what a segmentation cut off, and what is left."""
 
     def run(self) -> None:
         from r2s.recordings.open import convert
+        from r2s.viewer.cuts import draw_cuts
 
-        for line in convert(self.folder, self.to, self.only, self.force):
+        draw = draw_cuts if self.plot else None
+        for line in convert(self.folder, self.to, self.only, self.force, draw):
             print(line)
 
 

@@ -5,5 +5,6 @@
 - `open`: a recording, or a simulated motion, from a path; conversion of folders to NPZ.
 - `clouds`, `force_log`, `markers`, `swings`, `images`: files of each kind.
 - `cameras`, `views`, `rgbd`: depth images to clouds. `synthetic_rgbd`: rendered ones.
+- `segmentation`: the cloth among the points of a whole scene.
 - `checks`, `findings`: what is suspicious in a recording.
 """

@@ -141,6 +141,21 @@ def read_mask(path: Path, resolution: tuple[int, int]) -> Bool[np.ndarray, "down
     return image != 0 if image.ndim == 2 else (image[..., :3] != 0).any(axis=2)
 
 
+def read_colour(path: Path, resolution: tuple[int, int]) -> UInt8[np.ndarray, "down across 3"]:
+    """Red, green and blue of an image, PNG or JPG, in the pixels of the depth; as `read_depth`."""
+    cv2 = require("cv2", "camera", "colour images")
+    if path.suffix.lower() == ".png":
+        read_png(path)  # of a cut one OpenCV takes the rows that are there
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    whole = path.suffix.lower() == ".png" or b"\xff\xd9" in data[-64:].tobytes()  # JPG's end
+    # the camera's pixels, also where a tag asks viewers to turn them
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None or not whole:
+        raise ValueError(f"{path}: damaged or truncated image of {len(data)} bytes: copy it again")
+    _check_size(path, image, resolution, "register colour to depth, as the camera's driver can")
+    return image[..., ::-1]
+
+
 def encode_png(image: Num[np.ndarray, "down across *channel"]) -> bytes:
     """An image of 8 or 16 bits as PNG; colour in the order blue, green, red."""
     cv2 = require("cv2", "camera", "depth images")

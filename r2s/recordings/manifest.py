@@ -24,7 +24,8 @@ from r2s.recordings.recording import (
     SheetPlacement,
     make_recording,
 )
-from r2s.recordings.rgbd import find_rig, read_clouds, read_rig
+from r2s.recordings.rgbd import find_rig, frame_times, read_clouds, read_rig
+from r2s.recordings.segmentation import FrameCuts, Segmentation, Segmenter, read_colours
 from r2s.recordings.views import Views, shifted
 
 Vector = tuple[float, float, float]
@@ -108,7 +109,8 @@ class Scenario:
 
     A folder with a cameras.json holds RGB-D images (`r2s.recordings.rgbd`) instead of clouds: the
     cameras' own times or rate come before `frame_rate`, `cloud` transforms from their world, and
-    no hashes are kept. If there are `sessions`, a recording belongs to one of them.
+    no hashes are kept. If there are `sessions`, a recording belongs to one of them. `segmentation`
+    cuts the cloth out of clouds, or of images without masks unless cameras.json has its own.
     """
 
     folder: str
@@ -124,6 +126,7 @@ class Scenario:
     sessions: tuple[Session, ...] = ()
     doubt: MeasurementUncertainty | None = None
     views: Views | None = None
+    segmentation: Segmentation | None = None
 
     def __post_init__(self) -> None:
         not_negative("Hz", frame_rate=self.frame_rate)
@@ -230,22 +233,36 @@ def read_recordings(
 def sources(folder: Path | str, manifest: Manifest, name: str) -> list[Path]:
     """The files that a recording is read from, as far as they exist, sorted.
 
-    Its manifest, the gripper's path, cameras.json, and all in its folder but colour images.
+    Its manifest, the gripper's path, cameras.json, and all in its folder, but colour images only
+    where a segmentation reads them.
     """
     folder = Path(folder)
     _, scenario, match = _scenario_of(manifest, name)
     grippers = _gripper_files(folder, scenario, name, match)
-    inside = (path for path in (folder / name).rglob("*") if path.parent.name != "colour")
+    how = _segmentation(folder / name, scenario)
+    left_out = () if how is not None and how.colour is not None else ("colour",)
+    inside = (path for path in (folder / name).rglob("*") if path.parent.name not in left_out)
     files = (manifest_of(folder), *grippers, find_rig(folder / name), *inside)
     return sorted({path for path in files if path is not None and path.is_file()})
 
 
+def _segmentation(folder: Path, scenario: Scenario) -> Segmentation | None:
+    """How the cloth of the recording in a folder is cut out: as cameras.json says, else as here."""
+    own = read_rig(folder).segmentation if find_rig(folder) else None
+    return own or scenario.segmentation
+
+
 def read_recording(
-    folder: Path | str, manifest: Manifest, name: str, watch: Watch = iter
+    folder: Path | str,
+    manifest: Manifest,
+    name: str,
+    watch: Watch = iter,
+    cuts: list[FrameCuts] | None = None,
 ) -> Recording:
     """The recording in `folder`/`name`, of clouds or of RGB-D images, in metres and seconds.
 
-    Frames are read through `watch`, such as a bar that shows progress.
+    Frames are read through `watch`, such as a bar that shows progress. What a segmentation does to
+    each is appended to `cuts`.
 
     `info.verified`: True if all its files have the values listed in the manifest, None if some are
     not listed; False, with a warning, if a listed one differs or is missing.
@@ -254,21 +271,8 @@ def read_recording(
     """
     folder = Path(folder)
     scenario_name, scenario, match = _scenario_of(manifest, name)
-    files = _gripper_files(folder, scenario, name, match)
-    track, held = _held(files, scenario.gripper)
-    if find_rig(folder / name):
-        rig = read_rig(folder / name)
-        times, clouds = read_clouds(folder / name, rig, scenario.frame_rate, watch)
-        verified, numbers = None, list(range(len(times)))
-    else:
-        frames = find_frames(folder / name, READERS, scenario.first_frame)
-        times, numbers = times_of(folder / name, frames, scenario.frame_rate), frames.numbers
-        clouds = [read_cloud(frame) for frame in watch(frames.files)]
-        values = {f"{name}/{f.name}": c for f, c in zip(frames.files, clouds, strict=True)}
-        values |= {f.name: read_values(f) for f in files if f.suffix == ".npy"}
-        verified = _verify(manifest.files, name, values)
-        if scenario.drop_repeats:
-            clouds = [_distinct(points) for points in clouds]
+    paths = _gripper_files(folder, scenario, name, match)
+    track, held = _held(paths, scenario.gripper)
     shift, views = (0.0, 0.0, 0.0), scenario.views
     if scenario.sessions:
         patterns = [session.recordings for session in scenario.sessions]
@@ -278,6 +282,32 @@ def read_recording(
             box = session.workspace or views.clean.workspace
             views = replace(views, clean=replace(views.clean, workspace=box))
             views = shifted(views, shift)
+    cuts, rate = [] if cuts is None else cuts, scenario.frame_rate
+    if (rig := read_rig(folder / name) if find_rig(folder / name) else None) is not None:
+        times = frame_times(folder / name, rig, rate)
+        frames, used = None, _used(folder / name, scenario.frames_used, range(len(times)))
+    else:
+        frames = find_frames(folder / name, READERS, scenario.first_frame)
+        times = times_of(folder / name, frames, rate)
+        used = _used(folder / name, scenario.frames_used, frames.numbers)
+    knots, start = _clocks(name, track, times, scenario)
+    clock = knots - scenario.time_offset  # that of the frames
+    segmenter = _segmenter(folder / name, scenario, shift, held, clock, used, cuts)
+    if frames is None:
+        assert rig is not None
+        times, clouds = read_clouds(folder / name, rig, rate, watch, segmenter)
+        verified = None
+    else:
+        clouds = [read_cloud(frame) for frame in watch(frames.files)]
+        values = {f"{name}/{f.name}": c for f, c in zip(frames.files, clouds, strict=True)}
+        values |= {f.name: read_values(f) for f in paths if f.suffix == ".npy"}
+        verified = _verify(manifest.files, name, values)
+        if segmenter is not None:
+            clouds = _cut_out(segmenter, frames.files, times, clouds)
+        if scenario.drop_repeats:
+            clouds = [_distinct(points) for points in clouds]
+    if views is not None and segmenter is not None and cuts:  # what is cut off is not seen
+        views = replace(views, hidden=max(views.hidden, segmenter.how.gripper_radius))
     source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
     info = RecordingInfo(
         name=name,
@@ -285,7 +315,7 @@ def read_recording(
         fabric=match["fabric"],
         trial=match["trial"] or "1",
         source=source if verified else str(folder / name),
-        frames_used=_used(folder / name, scenario.frames_used, numbers),
+        frames_used=used,
         sheet=scenario.sheet,
         table_height=scenario.table_height,
         verified=verified,
@@ -293,22 +323,29 @@ def read_recording(
         doubt=scenario.doubt,
         views=views,
     )
-    knots = track.times
-    start = times[0] if times[0] > EPOCH else 0.0
+    return make_recording(
+        [to_world(scenario.cloud, points) + np.array(shift) for points in clouds],
+        times - start + scenario.time_offset,
+        *(held, knots - start, info),
+    )
+
+
+def _clocks(name: str, track: Track, times: np.ndarray, scenario: Scenario):
+    """The times of the path's knots on the clock of frames at `times`, [s], less the time offset;
+    and when that of a recording begins."""
+    knots, start = track.times, times[0] if times[0] > EPOCH else 0.0
     if knots is None:
-        knots = np.arange(len(held)) / scenario.gripper.rate
+        knots = start + np.arange(len(track.positions)) / scenario.gripper.rate
     else:
         start = knots[0]
-        knots = knots - start
-    times = times - start + scenario.time_offset
-    if times[-1] < knots[0] or times[0] > knots[-1]:
+    first, last = times[0] + scenario.time_offset, times[-1] + scenario.time_offset
+    if last < knots[0] or first > knots[-1]:
         raise ValueError(
-            f"recording {name}: the frames go from {times[0]:g} to {times[-1]:g} s, the gripper's "
-            f"path from {knots[0]:g} to {knots[-1]:g} s: they are not on one clock; give their "
+            f"recording {name}: the frames go from {first:g} to {last:g} s, the gripper's path "
+            f"from {knots[0]:g} to {knots[-1]:g} s: they are not on one clock; give their "
             "difference as time_offset [s]"
         )
-    points = [to_world(scenario.cloud, points) + np.array(shift) for points in clouds]
-    return make_recording(points, times, held, knots, info)
+    return knots, start
 
 
 def _gripper_files(folder: Path, scenario: Scenario, name: str, match: re.Match[str]) -> list[Path]:
@@ -358,6 +395,29 @@ def _used(folder: Path, used: tuple[int, ...], numbers: Sequence[int]) -> tuple[
             f"{numbers[-1]}, counted from the first"
         )
     return places[0], places[-1]
+
+
+def _segmenter(
+    folder: Path, scenario: Scenario, shift: Vector, path: Any, clock: Any, used: Any, cuts: Any
+) -> Segmenter | None:
+    """What cuts the cloth of a recording out of its frames; None: all points are of the cloth."""
+    if (how := _segmentation(folder, scenario)) is None:
+        return None
+    return Segmenter(
+        *(how, scenario.sheet, scenario.table_height, path, clock, str(folder)),
+        lambda points: to_world(scenario.cloud, points) + np.array(shift),
+        *(used, cuts),
+    )
+
+
+def _cut_out(segmenter: Segmenter, files: Sequence[Path], times: Any, clouds: Any) -> list[Any]:
+    """The clouds of files at times without what is not of the cloth; errors name the file."""
+    kept = []
+    for file, time, points in zip(files, times, clouds, strict=True):
+        colours = () if segmenter.how.colour is None else read_colours(file)
+        kept.append(points[segmenter(points, float(time), colours)])
+    segmenter.check()
+    return kept
 
 
 def _matching(name: str, patterns: Sequence[str], kind: str) -> tuple[int, re.Match[str]]:

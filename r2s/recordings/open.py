@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,10 @@ from r2s.recordings.manifest import (
     sources,
 )
 from r2s.recordings.recording import FORMAT, Recording, load, save
+from r2s.recordings.segmentation import FrameCuts, shares
 from r2s.recordings.swings import is_swing, read_swing
+
+Draw = Callable[[Path, str, list[FrameCuts]], None]  # a file, a title, what to draw
 
 
 @dataclass(frozen=True)
@@ -94,15 +97,20 @@ def load_trajectory(path: Path | str) -> SimulatedCloth:
 
 
 def convert(
-    folder: Path | str, to: Path | str, only: str = "", force: bool = False
+    folder: Path | str,
+    to: Path | str,
+    only: str = "",
+    force: bool = False,
+    draw: Draw | None = None,
 ) -> Iterator[str]:
     """Write `to`/NAME.npz for each recording in a folder; says what it does, line by line.
 
     `folder` holds recordings, or is one of them; `only` is a regular expression for names. Beside
     each NPZ lies NAME.sha256, of the files that it was made from: one that they still have is up to
-    date, and skipped unless `force`. A run that was killed continues where it was. Raises
-    ValueError or OSError: no such recordings; and, after all the others were converted, one for all
-    recordings that could not be read, with file and frame.
+    date, and skipped unless `force`. A run that was killed continues where it was. `draw`, such as
+    `r2s.viewer.cuts.draw_cuts`, draws NAME_cuts.png: what a segmentation cut off. Raises ValueError
+    or OSError: no such recordings; and, after all the others were converted, one for all recordings
+    that could not be read, with file and frame.
     """
     root, names = _names(Path(folder), only)
     manifest, to = manifest_for(root), Path(to)
@@ -111,7 +119,7 @@ def convert(
     for number, name in enumerate(names, 1):
         try:
             label = f"{name} ({number} of {len(names)})"
-            yield f"{name}: {_convert_one(root, manifest, name, to, force, label)}"
+            yield f"{name}: {_convert_one(root, manifest, name, to, force, label, draw)}"
         except (ValueError, OSError) as error:
             problems.append(str(error))
     if problems:
@@ -145,7 +153,7 @@ def _names(folder: Path, only: str) -> tuple[Path, list[str]]:
 
 
 def _convert_one(
-    root: Path, manifest: Manifest, name: str, to: Path, force: bool, label: str
+    root: Path, manifest: Manifest, name: str, to: Path, force: bool, label: str, draw: Draw | None
 ) -> str:
     file, mark = to / f"{name}.npz", to / f"{name}.sha256"
     total = hashlib.sha256(FORMAT.encode())
@@ -161,7 +169,13 @@ def _convert_one(
         return f"up to date, {file}"
     tqdm = require("tqdm", "study", "progress bars").tqdm
     bar = partial(tqdm, desc=label, unit=" frames", disable=None, leave=False)
-    recording = read_recording(root, manifest, name, bar)
+    cuts: list[FrameCuts] = []
+    try:
+        recording = read_recording(root, manifest, name, bar, cuts)
+    finally:  # it also shows why a recording is refused
+        if draw is not None and cuts:
+            draw(to / f"{name}_cuts.png", name, cuts)
     save(recording, file)
     write_text(mark, made_from + "\n")
-    return f"{len(recording.times)} frames, {int(recording.mask.sum())} points, {file}"
+    done = f"{len(recording.times)} frames, {int(recording.mask.sum())} points, {file}"
+    return done + (f"; cuts: {shares(np.sum([c.counts for c in cuts], axis=0))}" if cuts else "")

@@ -4,7 +4,8 @@ The folder of a recording holds, for each camera that `cameras.json` names,
 
     NAME/depth/000.png ...   16-bit PNG, or NPY; `depth_scale` metres per unit, 0 for no depth
     NAME/masks/000.png ...   not zero where the fabric is; same numbers ("masks": false for none)
-    NAME/colour/000.png ...  PNG or JPG, same numbers; may be missing, is not read
+    NAME/colour/000.png ...  PNG or JPG, same numbers, in the pixels of the depth; may be missing,
+                             is read where a segmentation has a colour
     NAME/times.csv           seconds, in the last column; may be missing if `frame_rate` is given
 
 and `cameras.json` lies there, or in the folder above for all recordings of one set: the fields of
@@ -17,7 +18,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -29,12 +30,14 @@ from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_
 from r2s.recordings.clocks import Frames, find_frames, times_of
 from r2s.recordings.clouds import Cleaning, clean, inside
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
+from r2s.recordings.segmentation import Segmentation, Segmenter
 
 NAME = "cameras.json"
 TOGETHER = 0.005  # [s]: frames of several cameras that are nearer in time are one frame
 MOST = 0.5  # of the points behind a mask: at least so many are in the workspace
 DISAGREE = 0.005  # [m]: cameras whose clouds are closer than this are not swapped
 COMPARED = 2000  # points of each cloud
+File = Path | None
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -76,6 +79,7 @@ class Rig:
       [Hz]; 0: all have them.
     - `pair_tolerance`: what the times of images may differ by that are one frame, [s]; 0: 5 ms, or
       a quarter of the shortest interval if that is less. Others are frames of their own.
+    - `segmentation`: how the cloth is cut out of what cameras without masks see; null: it is all.
     """
 
     cameras: Mapping[str, DepthCamera]
@@ -83,6 +87,7 @@ class Rig:
     frame_rate: float = 0.0
     pair_tolerance: float = 0.0
     note: str = ""
+    segmentation: Segmentation | None = None
 
     def __post_init__(self) -> None:
         if not self.cameras:
@@ -125,7 +130,13 @@ def rgbd_recording(
     `info.time_offset` is added to the cameras' times. `gripper_path`, `gripper_times`, `measured`
     (force, markers) and errors are as in `make_recording`; errors also as in `stream`.
     """
-    times, clouds = read_clouds(folder, rig or read_rig(folder))
+    rig, segmenter = rig or read_rig(folder), None
+    if rig.segmentation is not None:
+        path = np.asarray(gripper_path, float)
+        knots = np.asarray(gripper_times, float) - info.time_offset
+        what = rig.segmentation, info.sheet, info.table_height, path, knots, str(folder)
+        segmenter = Segmenter(*what, frames_used=info.frames_used)
+    times, clouds = read_clouds(folder, rig, segmenter=segmenter)
     clock = times + info.time_offset
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
 
@@ -135,69 +146,116 @@ def read_clouds(
     rig: Rig,
     frame_rate: float = 0.0,
     watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+    segmenter: Segmenter | None = None,
 ) -> tuple[Float[np.ndarray, " frame"], list[Float[np.ndarray, "point 3"]]]:
     """Times [s] on the cameras' clock, and the cleaned clouds [m]; raises as `stream`.
 
     Frames come through `watch`, such as a bar that shows progress.
     """
-    frames = list(watch(stream(folder, rig, frame_rate)))
+    frames = list(watch(stream(folder, rig, frame_rate, segmenter)))
     return np.array([time for time, _ in frames]), [cloud for _, cloud in frames]
 
 
 def stream(
-    folder: Path | str, rig: Rig, frame_rate: float = 0.0
+    folder: Path | str, rig: Rig, frame_rate: float = 0.0, segmenter: Segmenter | None = None
 ) -> Iterator[tuple[float, Float[np.ndarray, "point 3"]]]:
     """Time [s] and cleaned cloud [m] of one frame after the other: the images of one are in memory.
 
-    `frame_rate` [Hz] is used where the rig has none. Raises FileNotFoundError, ImportError (names
-    the extra), or ValueError that names the file or camera and frame, and what to do.
+    `frame_rate` [Hz] is used where the rig has none. A `segmenter` cuts the cloth out of what
+    cameras without masks see, and is checked after the last frame. Raises FileNotFoundError,
+    ImportError (names the extra), or ValueError that names the file or camera and frame, and what
+    to do.
     """
     folder = Path(folder)
-    rate = rig.frame_rate or frame_rate
-    files = {name: _files(folder / name, camera) for name, camera in rig.cameras.items()}
-    times = {name: times_of(folder / name, frames, rate) for name, (frames, _) in files.items()}
+    masked = all(camera.masks for camera in rig.cameras.values())
+    if rig.segmentation is not None and segmenter is None and not masked:
+        raise ValueError(f"{folder}: a segmentation needs sheet and grippers: use rgbd_recording")
+    coloured = bool(segmenter and segmenter.how.colour)
+    files = {
+        name: _files(folder / name, camera, coloured and not camera.masks)
+        for name, camera in rig.cameras.items()
+    }
+    depths = {name: frames for name, (frames, _, _) in files.items()}
     last: dict[str, bytes] = {}
     is_compared = False
-    try:
-        frames_of = pair(times, rig.pair_tolerance)
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from error
-    for frame, (time, chosen) in enumerate(frames_of):
+    for frame, (time, chosen) in enumerate(_paired(folder, rig, depths, frame_rate)):
         parts = {}
-        for name, index in chosen.items():
-            frames, masks = files[name]
-            parts[name] = _camera_cloud(rig, name, frames.files[index], masks[index], last)
+        for name, i in chosen.items():
+            frames, masks, colours = files[name]
+            parts[name] = _camera_cloud(rig, name, frames.files[i], masks[i], colours[i], last)
         if not is_compared and len(parts) > 1:
             is_compared = True
-            _check_swapped(folder, rig, parts)
-        cloud = clean(np.concatenate(list(parts.values())), rig.clean, frame)
+            _check_swapped(folder, rig, {name: part.points for name, part in parts.items()})
+        points = _cloth(list(parts.values()), time, segmenter)
+        cloud = clean(points, rig.clean, frame)
         if len(cloud) == 0:
             raise ValueError(
                 f"{folder}: frame {frame} at {time:g} s: no point is left in the workspace "
                 f"{rig.clean.workspace} [m]: check workspace, table and masks, or drop the frame"
             )
         yield time, cloud
+    if segmenter is not None:
+        segmenter.check()
 
 
-def _files(folder: Path, camera: DepthCamera) -> tuple[Frames, list[Path | None]]:
-    """The depth images of a camera, and the mask of each."""
+def frame_times(folder: Path | str, rig: Rig, frame_rate: float = 0.0) -> np.ndarray:
+    """The times [s] of the frames of all cameras, as `stream` gives them."""
+    depths = {n: find_frames(Path(folder) / n / "depth", images.DEPTHS) for n in rig.cameras}
+    return np.array([time for time, _ in _paired(Path(folder), rig, depths, frame_rate)])
+
+
+def _paired(folder: Path, rig: Rig, depths: Mapping[str, Frames], frame_rate: float):
+    rate = rig.frame_rate or frame_rate
+    times = {name: times_of(folder / name, frames, rate) for name, frames in depths.items()}
+    try:
+        return pair(times, rig.pair_tolerance)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from error
+
+
+class _Seen(NamedTuple):
+    """Points [m] of a camera in the workspace, colours if asked for, and how many are outside."""
+
+    points: np.ndarray
+    colours: np.ndarray
+    outside: int
+    masked: bool
+
+
+def _cloth(seen: list[_Seen], time: float, segmenter: Segmenter | None) -> np.ndarray:
+    """The points of the cloth: all behind masks, and what a segmenter keeps of the others."""
+    points = [part.points for part in seen if part.masked or segmenter is None]
+    whole = [part for part in seen if not part.masked]
+    if segmenter is not None and whole:
+        scene, colours = (np.concatenate([part[i] for part in whole]) for i in (0, 1))
+        outside = sum(part.outside for part in whole)
+        points.append(scene[segmenter(scene, time, colours, outside)])
+    return np.concatenate(points)
+
+
+def _files(
+    folder: Path, camera: DepthCamera, coloured: bool
+) -> tuple[Frames, list[File], list[File]]:
+    """The depth images of a camera, the mask of each, and the colour image if it is read."""
     if not folder.is_dir():
         raise FileNotFoundError(
             f"{folder}: no folder of the camera {folder.name!r}, which {NAME} names: "
             "restore it, or take the camera out"
         )
     depths = find_frames(folder / "depth", images.DEPTHS)
-    masks: list[Path | None] = [None] * len(depths.files)
+    masks: list[File] = [None] * len(depths.files)
     if camera.masks:
         if not (folder / "masks").is_dir():
             raise FileNotFoundError(
                 f"{folder / 'masks'}: no such folder: segment the fabric (SAM 2 writes such "
-                f'masks), or set "masks": false in {NAME}'
+                f'masks), or set "masks": false and give a segmentation in {NAME}'
             )
         masks = list(_same_frames(folder, "masks", depths, images.MASKS))
-    if (folder / "colour").is_dir():
-        _same_frames(folder, "colour", depths, images.COLOURS)
-    return depths, masks
+    colours: list[File] = [None] * len(depths.files)
+    if (folder / "colour").is_dir() or coloured:
+        read = _same_frames(folder, "colour", depths, images.COLOURS)
+        colours = list(read) if coloured else colours
+    return depths, masks, colours
 
 
 def _same_frames(folder: Path, kind: str, depths: Frames, suffixes: Collection[str]) -> list[Path]:
@@ -214,9 +272,14 @@ def _same_frames(folder: Path, kind: str, depths: Frames, suffixes: Collection[s
 
 
 def _camera_cloud(
-    rig: Rig, name: str, depth_file: Path, mask_file: Path | None, last: dict[str, bytes]
-) -> Float[np.ndarray, "point 3"]:
-    """World points [m] of the fabric that one camera sees in one frame."""
+    rig: Rig,
+    name: str,
+    depth_file: Path,
+    mask_file: File,
+    colour_file: File,
+    last: dict[str, bytes],
+) -> _Seen:
+    """World points [m] of the fabric, or without a mask of all, that a camera sees in a frame."""
     camera = rig.cameras[name]
     depth = images.read_depth(depth_file, camera.depth_scale, camera.resolution)
     _warn_of_repeats(name, depth_file, depth, last)
@@ -235,7 +298,10 @@ def _camera_cloud(
             f"workspace {rig.clean.workspace} [m], their median is at "
             f"{np.median(points, axis=0).round(3).tolist()} m: {_remedy(rig, name, seen)}"
         )
-    return points[kept]
+    colours = np.zeros((len(points), 3), np.uint8)
+    if colour_file is not None:
+        colours = images.read_colour(colour_file, camera.resolution)[where]
+    return _Seen(points[kept], colours[kept], int((~kept).sum()), mask_file is not None)
 
 
 def _mask(
