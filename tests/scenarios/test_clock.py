@@ -39,11 +39,11 @@ def test_dropped_frames_and_cameras_that_begin_late_change_nothing_else(even, ke
 
 
 def test_frames_off_their_times_lie_on_the_motion_between(even):
-    """To first order by the velocity."""
+    """To first order by the velocity, and to the error of steps that are not quite as long."""
     late = np.array([0, 4, -3, 2, 4, -4, 1, -2, 3, 0]) * 1e-3
     motion = run(EVEN._replace(times=EVEN.times + late).scenario(SHAPE), FABRIC)
     moved = even.x + even.v * late[:, None, None]
-    assert np.abs(motion.x - moved).mean() < 0.1 * np.abs(moved - even.x).mean()
+    assert np.abs(motion.x - moved).max() < 0.4 * np.abs(moved - even.x).max()
 
 
 def test_a_motion_that_ends_before_a_frame_is_no_motion_of_it():
