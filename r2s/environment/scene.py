@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.arrays import is_traced
@@ -117,6 +118,14 @@ class Scene(eqx.Module):
                     f"{name} must be {expected}, a place or velocity of each vertex of the mesh; "
                     f"got {array.shape}"
                 )
+
+    def starting(self, **arrays: ArrayLike | None) -> list[Array | None]:
+        """Arrays of three numbers for each vertex in the precision of the mesh; raises as
+        `check_vertices`."""
+        dtype = self.mesh.rest.dtype
+        made = {n: None if each is None else jnp.asarray(each, dtype) for n, each in arrays.items()}
+        self.check_vertices(**made)
+        return list(made.values())
 
     def place(
         self, x: Float[Array, "vertex 3"], pinned: Float[Array, "pinned 3"]

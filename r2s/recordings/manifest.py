@@ -285,6 +285,8 @@ def _scenario_of(manifest: Manifest, name: str) -> tuple[str, Scenario, re.Match
 
 
 def _read_path(file: Path) -> np.ndarray:
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: there is no such file, which gripper.file names")
     path = read_values(file)
     try:
         return numbers("the gripper path", path, "knot", *["gripper"] * (path.ndim - 2), 3)

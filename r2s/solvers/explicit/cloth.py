@@ -173,7 +173,7 @@ class ExplicitCloth(eqx.Module):
 
         The `acceleration` is not used.
         """
-        self.scene.check_vertices(x=x, v=v, acceleration=acceleration)
+        x, v, _ = self.scene.starting(x=x, v=v, acceleration=acceleration)
         v = jnp.zeros_like(x) if v is None else v
         return ExplicitState(x, v, *no_memory(self.scene.mesh, self.grid, x.dtype), no_failure())
 
