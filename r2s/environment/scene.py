@@ -119,13 +119,18 @@ class Scene(eqx.Module):
                     f"got {array.shape}"
                 )
 
-    def starting(self, **arrays: ArrayLike | None) -> list[Array | None]:
-        """Arrays of three numbers for each vertex in the precision of the mesh; raises as
-        `check_vertices`."""
-        dtype = self.mesh.rest.dtype
-        made = {n: None if each is None else jnp.asarray(each, dtype) for n, each in arrays.items()}
-        self.check_vertices(**made)
-        return list(made.values())
+    def starting(
+        self, x: ArrayLike, v: ArrayLike | None = None, acceleration: ArrayLike | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Positions, velocities and accelerations (default: zero) of the vertices in the precision
+        of the mesh; raises as `check_vertices`."""
+        x = jnp.asarray(x, self.mesh.rest.dtype)
+        v, acceleration = (
+            jnp.zeros_like(x) if each is None else jnp.asarray(each, x.dtype)
+            for each in (v, acceleration)
+        )
+        self.check_vertices(x=x, v=v, acceleration=acceleration)
+        return x, v, acceleration
 
     def place(
         self, x: Float[Array, "vertex 3"], pinned: Float[Array, "pinned 3"]

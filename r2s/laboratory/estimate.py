@@ -11,7 +11,7 @@ should they grow by as much (Birge 1932).
 
 import time
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -183,13 +183,14 @@ def _residuals(place: Array, args: tuple[tuple[Test, ...], ParameterSpace]) -> A
     1 for `REACH` standard deviations on either side."""
     tests, space = args
     fabric, zeros = space(place[: space.dim]), iter(place[space.dim :])
-    shifts = ((2 * next(zeros) - 1) * _reach(t) if isinstance(t, Pull) else 0.0 for t in tests)
+    shifts = [_shift(t, next(zeros)) if isinstance(t, Pull) else 0.0 for t in tests]
     pairs = zip(tests, shifts, strict=True)
     return jnp.concatenate([_residuals_of(test, fabric, shift) for test, shift in pairs])
 
 
-def _reach(pull: Pull) -> Array:
-    return REACH * pull.zero_deviation
+def _shift(pull: Pull, place: Any) -> Any:
+    """Of its zero [m], from 0 to 1."""
+    return (2 * place - 1) * REACH * pull.zero_deviation
 
 
 def _prior(tests: Sequence[Test], space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
@@ -206,14 +207,17 @@ def _zeros(
     tests: Sequence[Test], places: np.ndarray, deviations: np.ndarray
 ) -> tuple[Nuisance, ...]:
     """The zero of each pull whose own is uncertain."""
-    pulls = [test for test in tests if isinstance(test, Pull)]
-    zeros = []
-    for pull, place, deviation in zip(pulls, places, deviations, strict=True):
-        if (reach := float(_reach(pull))) > 0:
-            value, error = float(pull.zero) + (2 * place - 1) * reach, 2 * reach * deviation
-            name = pull.name.rsplit(": ", 1)[-1]
-            zeros.append(Nuisance(f"zero of {name}", "m", float(value), float(error)))
-    return tuple(zeros)
+    rows = zip([t for t in tests if isinstance(t, Pull)], places, deviations, strict=True)
+    return tuple(
+        Nuisance(
+            f"zero of {pull.name.rsplit(': ', 1)[-1]}",
+            "m",
+            float(pull.zero + _shift(pull, place)),
+            float(_shift(pull, 0.5 + deviation)),
+        )
+        for pull, place, deviation in rows
+        if pull.zero_deviation > 0
+    )
 
 
 def _descend(

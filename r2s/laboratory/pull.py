@@ -28,7 +28,6 @@ READING = 0.02, 0.005  # of a tension: relative, and of the largest of its curve
 WIDTH = 0.02  # of a relative width
 BACK, BROKEN, PRELOAD = 0.1, 0.7, 0.3  # shares of the largest, beyond which it is no pull
 PARTS, RISE = 50, 5.0  # of a curve whose start is sought; first slope: forces up to so many visible
-DOUBT = 0.5  # standard deviation of a zero: share of the way to it, and of its reading error
 NEWTON = 30  # iterations at most; each is exact for a law of constant stiffness
 
 
@@ -92,13 +91,16 @@ class Pull(eqx.Module):
         expect(middle.shape == force.shape, f"{name}: as many widths as forces are needed")
         is_force = pretension is None or 0 < pretension < np.inf
         expect(is_force, f"{name}: a pretension is a force [N] above 0, got {pretension}")
-        _check(name, extension / length, force / wide, middle, pretension is None and zero is None)
+        _check(name, extension / length, force / wide, middle)
         rest = Rest(zero, 0.0, 0.0) if zero is not None else rest_of(extension, force, pretension)
-        first = float(extension.min())
+        first, last = float(extension.min()), float(extension.max())
+        expect(rest.extension < last, f"{name}: the zero, {zero} m, is beyond all extensions")
+        share = (first - rest.extension) / (last - rest.extension)
         expect(
-            first - rest.extension < np.ptp(extension),
-            f"{name}: the force at rest is more than the first slope explains: subtract the "
-            "machine's offset from the forces, or give the extension at rest [m] as 'zero'",
+            zero is not None or share < (PRELOAD if pretension is None else BROKEN),
+            f"{name}: at rest the force is {share:.0%} of the largest: give the 'pretension' [N] "
+            "under which the strip was clamped, or its 'zero', the extension at rest [m], or "
+            "subtract the machine's offset from the forces",
         )
         # the clamps are `length` apart at a reading of 0, or at the first of a machine's position
         length += rest.extension - min(0.0, first, key=lambda at: abs(at - rest.extension))
@@ -108,7 +110,7 @@ class Pull(eqx.Module):
         stretches, tensions, widths = (jnp.asarray(column, float) for column in columns.T)
         numbers = direction, specimen, rest.extension, rest.deviation, length
         scalars = (jnp.asarray(number, float) for number in numbers)
-        return cls(stretches, tensions, widths, *scalars, name)
+        return cls(stretches, tensions, widths, *scalars, name=name)
 
     @property
     def count(self) -> int:
@@ -204,34 +206,27 @@ def rest_of(
     """
     ends = np.linspace(extension.min(), extension.max(), PARTS + 1)[1:-1]
     d, f = _means(np.stack([extension, force], axis=1), ends).T
-    span, width = np.ptp(f), np.ptp(d)
+    first, span, part = float(extension.min()), np.ptp(f), np.ptp(d) / PARTS
     noise = np.median(np.abs(np.diff(f, 2))) if len(f) > 2 else 0.0  # 1.7 standard deviations
-    visible = max(READING[1] * span, 3 * noise)
+    visible = min(max(READING[1] * span, 3 * noise), span / 10)
     start = min(int(np.flatnonzero(f - f[0] <= visible)[-1]) + 1, len(f) - 2)
     stop = max(start + 4, int(np.argmax(f - f[0] > RISE * visible)))
     slope, at_none = np.polyfit(d[start:stop], f[start:stop], 1)
     if slope <= 0:
-        slope, at_none = span / width, f[0] - span / width * d[0]
-    first, taut = float(extension.min()), (f[0] - at_none) / slope
-    force_at_first = float(at_none + slope * first)
-    is_slack = taut > first + 1.5 * width / PARTS
-    if is_slack:
-        before = d < taut - 0.5 * width / PARTS
-        shown = float(np.mean(f[before]))
-    elif pretension is not None and force_at_first < pretension / 2:
-        shown = force_at_first - pretension
-    else:
-        shown = min(force_at_first, 0.0)
-    rest = float((shown - at_none) / slope)
-    reach = abs(rest - first)
-    if is_slack:
-        reach = min(reach, float(np.ptp(d[start:stop])))
-    return Rest(rest, float(DOUBT * np.hypot(reach, READING[1] * span / slope)), shown)
+        slope, at_none = span / np.ptp(d), f[0] - span / np.ptp(d) * d[0]
+    taut, at_first = (f[0] - at_none) / slope, at_none + slope * first
+    shown, reach = min(at_first, 0.0), np.inf
+    if taut > first + 1.5 * part:
+        shown, reach = np.mean(f[d < taut - part / 2]), np.ptp(d[start:stop])
+    elif pretension is not None and at_first < pretension / 2:
+        shown = at_first - pretension
+    rest = (shown - at_none) / slope
+    # as far as it is extrapolated, since curves bend; and the reading error of four means
+    doubt = np.hypot(min(abs(rest - first), reach), READING[1] * span / slope / 2)
+    return Rest(float(rest), float(doubt), float(shown))
 
 
-def _check(
-    name: str, strain: np.ndarray, tension: np.ndarray, across: np.ndarray, is_from_rest: bool
-) -> None:
+def _check(name: str, strain: np.ndarray, tension: np.ndarray, across: np.ndarray) -> None:
     """Raise `ValueError` for a curve that is no pull or has other units."""
     is_finite = np.isfinite(strain).all() and np.isfinite(tension).all()
     expect(is_finite, f"{name}: extension and force must be finite")
@@ -248,12 +243,6 @@ def _check(
     expect(rises, f"{name}: the force does not rise with the extension: are columns swapped?")
     last = tension[strain > 0.98 * most].mean()
     expect(last > BROKEN * strongest, f"{name}: the force falls before the end: leave that out")
-    first = np.min(tension[strain < 0.02 * most], initial=strongest) / strongest
-    expect(
-        not (is_from_rest and PRELOAD < first < 1),
-        f"{name}: at rest the force is {first:.0%} of the largest: give the 'pretension' [N] under "
-        "which the strip was clamped, or subtract the machine's offset from the forces",
-    )
     widths = across[np.isfinite(across)]
     expect(((widths > 0.05) & (widths < 3)).all(), f"{name}: are the widths in metres?")
 

@@ -14,8 +14,9 @@ from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "sec": 1.0}
-NEWTONS = {"N": 1.0, "mN": 1e-3, "cN": 1e-2, "kN": 1e3, "gf": 9.80665e-3, "kgf": 9.80665}
-METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+NEWTONS = {"N": 1.0, "mN": 1e-3, "cN": 1e-2, "kN": 1e3}
+NEWTONS |= {"gf": 9.80665e-3, "kgf": 9.80665, "lbf": 4.4482216}
+METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 SHARES = {"-": 1.0, "%": 1e-2, "mm/mm": 1.0, "m/m": 1.0}
 GRAMS = ("g", "kg", "grams", "kilograms")  # of mass: no force
 NAMES = {  # of columns in what testers export, English and German
@@ -139,17 +140,15 @@ def _find_header(
     kept: Sequence[tuple[int, str]], choices: Sequence[Mapping[str, Units]]
 ) -> tuple[int, str]:
     """The index of the header among some lines, and what parts its columns; where none has all
-    columns, the line before the first numbers."""
+    columns, the first line of the most cells."""
     for at, (_, line) in enumerate(kept[:HEADER_WITHIN]):
         for delimiter in ";\t,":
             titles = [(cell, "") for cell in _cells(line, delimiter)]
             if all(any(_named(titles, *each) for each in c.items()) for c in choices):
                 return at, delimiter
-    for at, (_, line) in enumerate(kept[1:HEADER_WITHIN]):
-        delimiter = max(",;\t", key=kept[at][1].count)
-        if sum(map(_is_number, _cells(line, delimiter))) > 1:
-            return at, delimiter
-    return 0, max(",;\t", key=kept[0][1].count)
+    counts = [max(map(line.count, ",;\t")) for _, line in kept[:HEADER_WITHIN]]
+    at = counts.index(max(counts))
+    return at, max(",;\t", key=kept[at][1].count)
 
 
 def _named(titles: Sequence[tuple[str, str]], name: str, units: Units) -> list[tuple[int, str]]:
@@ -204,11 +203,9 @@ def _column(
             f"{path}: {header[index]!r} is a mass: a force is in N, or in gf where a scale "
             "shows grams (1 gf = 9.80665 mN): name the column force_gf if it does"
         )
-    name = next(name for name, columns in named.items() if columns)
+    known = [f"{', '.join(units)} as '{n} [{next(iter(units))}]'" for n, units in choice.items()]
     raise ValueError(
-        f"{path}: the unit of {header[index]!r} is not known: write one of "
-        f"{', '.join(unit for units in choice.values() for unit in units)} into the header, as in "
-        f"'{name} [{next(iter(choice[name]))}]'"
+        f"{path}: the unit of {header[index]!r} is not known: write one of {' or '.join(known)}"
     )
 
 
@@ -223,22 +220,15 @@ def _is_number(cell: str) -> bool:
 def _with_points(
     path: Path | str, lines: Sequence[tuple[int, list[str]]]
 ) -> list[tuple[int, list[str]]]:
-    """Lines of numbers with decimal points, which may have had decimal commas, and thousands."""
-    numbers = [cell for _, cells in lines for cell in cells if "," in cell]
-    if not numbers:
-        return list(lines)
-    both = next((cell for cell in numbers if "." in cell), "")
-    decimal = max(",.", key=both.rfind) if both else ","
-    other = ",."[decimal == ","]
-    grouped = rf"[+-]?\d{{1,3}}(\{other}\d{{3}})+(\{decimal}\d*)?"
-    for number, cells in lines:
-        for cell in cells:
-            if other in cell and not (both and re.fullmatch(grouped, cell)):
-                raise ValueError(
-                    f"{path}: line {number}: decimal commas and decimal points are mixed, found "
-                    f"{cell!r}: export it with one of them, without marks for thousands"
-                )
-    return [(n, [c.replace(other, "").replace(decimal, ".") for c in cells]) for n, cells in lines]
+    """Lines of numbers with decimal points, which may have had decimal commas."""
+    have = [{mark for cell in cells for mark in ",." if mark in cell} for _, cells in lines]
+    if {",", "."} <= set().union(*have):
+        at = next(at for at, marks in enumerate(have) if "," in marks)
+        raise ValueError(
+            f"{path}: line {lines[at][0]}: {lines[at][1]}: commas and points are mixed: export it "
+            "with one decimal mark, and none for thousands"
+        )
+    return [(number, [cell.replace(",", ".") for cell in cells]) for number, cells in lines]
 
 
 def number_in(path: Path | str, line: int, cell: str, what: str = "a finite number") -> float:
