@@ -548,6 +548,16 @@ def test_pulls_of_knits_are_read_in_metres(tmp_path: Path):
         read_knit(file, 0.0)
 
 
+@pytest.mark.parametrize("name", ["none.json", "no folder/tests.json"])
+def test_a_missing_file_is_named_without_the_number_of_the_error(tmp_path: Path, capsys, name):
+    pytest.importorskip("tyro")
+    from r2s.cli.main import main
+
+    missing = str(tmp_path / name)
+    assert main(["estimate", missing, "--density", "0.2", "--out", str(tmp_path / "a.json")]) == 1
+    assert capsys.readouterr().err == f"r2s: error: {missing}: No such file or directory\n"
+
+
 @pytest.mark.slow(group="study")
 def test_tests_alone_make_a_card(tmp_path: Path, capsys: pytest.CaptureFixture):
     pytest.importorskip("tyro")
