@@ -94,7 +94,8 @@ class Pull(eqx.Module):
         _check(name, extension / length, force / wide, middle)
         rest = Rest(zero, 0.0, 0.0) if zero is not None else rest_of(extension, force, pretension)
         first, last = float(extension.min()), float(extension.max())
-        expect(rest.extension < last, f"{name}: the zero, {zero} m, is beyond all extensions")
+        where = f"{name}: the zero, {rest.extension:.3g} m, is beyond all extensions"
+        expect(rest.extension < last, f"{where}: give the extension at rest [m] as 'zero'")
         share = (first - rest.extension) / (last - rest.extension)
         expect(
             zero is not None or share < (PRELOAD if pretension is None else BROKEN),

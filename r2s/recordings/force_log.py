@@ -32,7 +32,7 @@ NAMES = {  # of columns in what testers export, English and German
 KINDS = ("tensile", "standard", "crosshead", "nominal", "engineering", "elapsed", "nominelle")
 UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})
 UNIT = r"(?P<gap>[\s_]*(?:\bin\s|[/,:])?\s*[\[(]?)\s*(?P<unit>[^\s\[\]()]*)\s*[\])]?"
-HEADER_WITHIN = 100  # lines
+HEADER_WITHIN, LONGEST_LINE = 100, 100_000  # lines, and characters
 WORKBOOKS = b"PK\x03\x04", b"\xd0\xcf\x11\xe0"  # xlsx, xls
 Units = Mapping[str, float]
 
@@ -63,7 +63,10 @@ def read_choices(
     if not kept:
         raise ValueError(f"{path}: the log is empty")
     at, delimiter = _find_header(kept, choices)
-    rows = [(number, _cells(line, delimiter)) for number, line in kept[at:]]
+    rows = _rows(path, kept[at:], delimiter)
+    # delimiters may end a line
+    width = max((i for i, cell in enumerate(rows[0][1], 1) if cell), default=0)
+    rows = [(n, c[:width] if not any(c[width:]) else c) for n, c in rows]
     header, below = rows[0][1], [_bare(cell) for cell in rows[1][1]] if len(rows) > 1 else []
     every = {u for choice in (*choices, optional) for units in choice.values() for u in units}
     has_units = not any(map(_is_number, below)) and not every.isdisjoint(below)
@@ -99,8 +102,7 @@ def read_lines(path: Path | str) -> list[tuple[int, list[str]]]:
     Raises FileNotFoundError, or a ValueError that names the file.
     """
     kept = _kept_lines(path)
-    delimiter = max(",;\t", key=kept[0][1].count) if kept else ","
-    return [(number, _cells(line, delimiter)) for number, line in kept]
+    return _rows(path, kept, max(",;\t", key=kept[0][1].count) if kept else ",")
 
 
 def _kept_lines(path: Path | str) -> list[tuple[int, str]]:
@@ -121,17 +123,21 @@ def _kept_lines(path: Path | str) -> list[tuple[int, str]]:
             break
     else:
         raise ValueError(f"{path}: no text in UTF-8, UTF-16 or Windows-1252: export it again")
-    kept = [(n, line) for n, line in lines if line.strip(" \t;,") and line.lstrip()[0] != "#"]
-    for number, line in kept:
-        if "\0" in line or line.count('"') % 2:
-            what = "no text" if "\0" in line else "a quotation mark is not closed"
-            raise ValueError(f"{path}: line {number}: {what}: export it again")
-    return kept
+    if any("\0" in line or len(line) > LONGEST_LINE for _, line in lines):
+        raise ValueError(f"{path}: no text: export it again")
+    return [(n, line) for n, line in lines if line.strip(" \t;,") and line.lstrip()[0] != "#"]
+
+
+def _rows(
+    path: Path | str, lines: Sequence[tuple[int, str]], delimiter: str
+) -> list[tuple[int, list[str]]]:
+    for number, line in lines:
+        if line.count('"') % 2:
+            raise ValueError(f"{path}: line {number}: a quotation mark is not closed: close it")
+    return [(number, _cells(line, delimiter)) for number, line in lines]
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
-    """Of a line; delimiters at its end are none."""
-    line = line.rstrip(f" \t{delimiter}")
     cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     return [cell.strip() for cell in cells]
 
@@ -156,15 +162,10 @@ def _named(titles: Sequence[tuple[str, str]], name: str, units: Units) -> list[t
 
     Columns of a known unit come first, then those of the name itself, then of its `NAMES`.
     """
-    kinds, others = (
-        "|".join(KINDS),
-        "|".join((re.escape(name.translate(UMLAUTS)), *NAMES.get(name, ()))),
-    )
-    named = []
-    for pattern in (
-        re.escape(name),
-        rf"(?:(?:{kinds})[\s_-]+)*(?:{others})(?:\s*\([^)]*\)(?=\s*[\[(]))?",
-    ):
+    own, named = re.escape(name.translate(UMLAUTS)), []
+    kinds, others = "|".join(KINDS), "|".join((own, *NAMES.get(name, ())))
+    remark = r"(?:\s*\([^)]*\)(?=\s*[\[(]))?"
+    for pattern in (own, rf"(?:(?:{kinds})[\s_-]+)*(?:{others}){remark}"):
         matches = []
         for index, (title, below) in enumerate(titles):
             match = re.fullmatch(pattern + UNIT, title.translate(UMLAUTS), re.IGNORECASE)

@@ -23,6 +23,8 @@ X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
         ("time_us\tforce_kN", "1500000\t0.0025", (1.5, 2.5)),
         ("n,force_gf,extra,time_s", "9,1000,x,1.5", (1.5, 9.80665)),
         ("Prüfzeit [s];Kraft [N]", "1,5;2,5", (1.5, 2.5)),
+        ("time_s,force_N,note", "1.5,2.5,", (1.5, 2.5)),
+        ('2" grips\ntime_s,force_N', "1.5,2.5,,", (1.5, 2.5)),
         ("Load cell: 500 N\nTime,Load\n(sec),(N)", "1.5,2.5", (1.5, 2.5)),
         ("Elapsed time (s)\tLoad (lbf)\t", "1.5\t2\t", (1.5, 8.8964432)),
     ],
