@@ -135,26 +135,37 @@ def _both_ways(real: Clouds, other: Clouds) -> float:
     return 1e3 * float(np.mean([distances(a, b)["chamfer"] for a, b in pairs]))
 
 
-def compared(table: dict[str, dict[str, float]], fabrics: list[str], one: str, other: str) -> Line:
+def compared(
+    table: dict[str, dict[str, float]], fabrics: list[str], one: str, other: str
+) -> list[Line]:
     """Whether one column of a table [mm] is below another: mean difference and p by sign flips.
+
+    Of the recordings that have both; no line where none has.
 
     `table`: the columns of each recording, whose `fabrics` are given. Flipped are the signs of all
     recordings of a fabric together, since they are alike, and of every recording alone.
     """
-    differences = np.array([row[one] - row[other] for row in table.values()])
-    names = sorted(set(fabrics))
-    by_fabric = np.array([differences[np.array(fabrics) == name].mean() for name in names])
-    return {
+    pairs = zip(table.values(), fabrics, strict=True)
+    both = [(row[one] - row[other], fabric) for row, fabric in pairs if {one, other} <= row.keys()]
+    if not both:
+        return []
+    differences, whose = (np.array(column) for column in zip(*both, strict=True))
+    by_fabric = np.array([differences[whose == name].mean() for name in sorted(set(whose))])
+    line = {
         "compared": f"{one} less {other}",
         "mean": f"{differences.mean():.1f}",
         "better": f"{int(np.sum(differences < 0))} of {len(differences)}",
         "p of fabrics": f"{_sign_flips(by_fabric):.3f}",
         "p of recordings": f"{_sign_flips(differences):.3f}",
     }
+    return [line]
 
 
 def _sign_flips(differences: np.ndarray) -> float:
-    """Two-sided p of the mean of differences that could as well have had the other sign."""
+    """Two-sided p of the mean of differences that could as well have had the other sign; one alone
+    says nothing."""
+    if len(differences) < 2:
+        return 1.0
     test = stats.permutation_test(
         (differences,), np.mean, permutation_type="samples", n_resamples=10_000
     )

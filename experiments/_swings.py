@@ -44,6 +44,8 @@ def predict_swings(
     swings = {file.stem: _read(file) for file in sorted(folder.glob("*.npz"))}
     if not set(LEARNT) <= set(swings):
         raise ValueError(f"{folder}: expected the swings {', '.join(LEARNT)}")
+    if len(swings) == len(LEARNT):
+        raise ValueError(f"{folder}: expected another swing, which those of the estimate predict")
     problems = tuple(_problem(swings.pop(name), space) for name in LEARNT)
     estimate = descend(problems, BUDGET, key=jax.random.key(0))
     offset = np.array([np.mean(_shifts(estimate, axis)) for axis in "xyz"])

@@ -47,16 +47,19 @@ def predict_folds(options, space: r2s.ParameterSpace, samples: list[r2s.Fabric])
         for name in filter(moved.get, moved):
             row[name], row[f"{name}, placed"] = errors(real, moved[name])
         table[info.name] = row
-        means = {n: np.mean([row[n] for row in table.values()]) for n in row}
+        columns = dict.fromkeys(name for row in table.values() for name in row)
+        means = {n: np.mean([row[n] for row in table.values() if n in row]) for n in columns}
         rows = [*table.items(), ("mean", means)]
-        lines = [{"recording": n} | {k: f"{v:.1f}" for k, v in r.items()} for n, r in rows]
+        texts = {n: {k: f"{v:.1f}" for k, v in r.items()} for n, r in rows}
+        lines = [{"recording": n} | {k: r.get(k, "-") for k in columns} for n, r in texts.items()]
         keep(options.out, lines, "Real folds, predicted from lifts: mean distance both ways [mm].")
     fabrics, tests = [fold.info.fabric for fold in folds], []
     for end in ("", ", placed"):
         for other in ("prior", "other fabrics' lifts", "other trial"):
-            tests.append(compared(table, fabrics, f"own lift{end}", f"{other}{end}"))
-    path = options.out.with_stem(f"{options.out.stem}_tests")
-    keep(path, tests, "Own lift against others [mm].")
+            tests += compared(table, fabrics, f"own lift{end}", f"{other}{end}")
+    if tests:
+        path = options.out.with_stem(f"{options.out.stem}_tests")
+        keep(path, tests, "Own lift against others [mm].")
 
 
 if __name__ == "__main__":

@@ -215,8 +215,14 @@ FAULTS = (
     ),
     Fault(
         "pull: tension over the length",
-        "1 + extension / length, force / wide",
-        "1 + extension / length, force / length",
+        "(force - rest.force) / wide",
+        "(force - rest.force) / length",
+        "laboratory/test_laboratory.py",
+    ),
+    Fault(
+        "pull: the zero of a pretension after the first reading",
+        "rest = (shown - at_none) / slope",
+        "rest = (at_none - shown) / slope",
         "laboratory/test_laboratory.py",
     ),
     Fault(

@@ -8,6 +8,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import types
 import typing
@@ -18,6 +19,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T")
+# or a string, which may look like one
+COMMENT = re.compile(r'("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/', re.DOTALL)
 
 
 @functools.cache
@@ -100,18 +103,21 @@ def read_npz(path: Path | str, *needed: str) -> dict[str, np.ndarray]:
     return arrays
 
 
-def read_json(path: Path | str, kind: type[T]) -> T:
+def read_json(path: Path | str, kind: type[T], comments: bool = False) -> T:
     """Read the dataclass `kind` from JSON: its fields, no more and (but for defaults) no less.
 
     Fields are numbers (finite), strings, booleans, tuples (JSON lists), mappings and dataclasses,
-    or one of these or null.
+    or one of these or null. With `comments`, those of C++ are skipped.
     A class attribute `former` of `kind` has the present names of fields that files call otherwise.
     The metadata "unknown" of a field is the hint in the error when it is missing or null. Raises
     OSError, or a ValueError that names the file and the field: no JSON, fields missing or unknown,
     values of another type, or what `kind` itself refuses.
     """
     try:
-        value = json.loads(Path(path).read_text(encoding="utf-8"))
+        text = Path(path).read_text(encoding="utf-8-sig")
+        if comments:
+            text = COMMENT.sub(lambda m: m[1] or re.sub(r"[^\n]", " ", m[0]), text)
+        value = json.loads(text)
     except ValueError as error:
         raise ValueError(f"{path}: no JSON: {error}") from error
     return parse(kind, value, f"{path}")

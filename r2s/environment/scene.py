@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.arrays import is_traced
@@ -121,6 +122,19 @@ class Scene(eqx.Module):
                 bad = ~np.isfinite(np.asarray(array)).all(axis=1)
                 if bad.any():
                     raise ValueError(f"{name} of vertex {int(bad.argmax())} is not finite")
+
+    def starting(
+        self, x: ArrayLike, v: ArrayLike | None = None, acceleration: ArrayLike | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Positions, velocities and accelerations (default: zero) of the vertices in the precision
+        of the mesh; raises as `check_vertices`."""
+        x = jnp.asarray(x, self.mesh.rest.dtype)
+        v, acceleration = (
+            jnp.zeros_like(x) if each is None else jnp.asarray(each, x.dtype)
+            for each in (v, acceleration)
+        )
+        self.check_vertices(x=x, v=v, acceleration=acceleration)
+        return x, v, acceleration
 
     def place(
         self, x: Float[Array, "vertex 3"], pinned: Float[Array, "pinned 3"]

@@ -354,9 +354,11 @@ def cma_es(
     first = np.r_[np.full(space.dim, 0.5), np.zeros(len(moved))]
     low = [0.0] * space.dim + [-FARTHEST] * len(moved)
     high = [1.0] * space.dim + [FARTHEST] * len(moved)
+    generator = np.random.default_rng(int(random.randint(key, (), 1, 2**31 - 1)))
     options = {
         "bounds": [low, high],
-        "seed": int(random.randint(key, (), 1, 2**31 - 1)),
+        "seed": np.nan,  # else cma seeds the generator that all share
+        "randn": lambda *shape: generator.standard_normal(shape),
         "maxfevals": evaluations,
         "verbose": -9,
         "CMA_stds": [1.0] * space.dim + [2.0] * len(moved),

@@ -3,14 +3,15 @@
     by_tests = estimate((pull_along_warp, pull_along_weft, cantilever), on_cloth(density))
     space = informed(on_cloth(density), by_tests)      # for an estimate from motions beside them
 
-The estimate has the least sum of squares of all tests' residuals and of the prior of the space.
+The estimate has the least sum of squares of all tests' residuals and of the prior of the space. The
+zero of each pull is a nuisance parameter, with the prior that its curve gives (`pull.rest_of`).
 Standard errors are those of the linearised problem; where the tests scatter by more than they
 should they grow by as much (Birge 1932).
 """
 
 import time
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,9 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 from jaxtyping import Array
+from scipy.linalg import block_diag
+from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
-from r2s.estimation.estimate import Estimate
+from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import MARGIN
 from r2s.estimation.least_squares import BoundedGaussNewton
 from r2s.estimation.method import Progress, tell
@@ -37,6 +40,7 @@ TOLERANCE = 1e-4  # relative, of the sum of squares or of a step
 MAX_STEPS = 60
 SLACK = 0.02  # of a variance: information that a motion is not taken to add
 IDENTIFIED = 0.5  # of the prior's standard error: below, tests identify a parameter
+REACH = 5.0  # standard deviations of a zero, at most, that an estimate moves it by
 POOR_FIT = 3.0  # standard deviations (root mean square), beyond which a test does not fit
 
 
@@ -63,9 +67,10 @@ def estimate(
     begun = time.perf_counter()
     tests = tuple(tests)
     quick = tuple(test for test in tests if not isinstance(test, Drape))
-    start = np.asarray(space.prior()[0])
+    start = _prior(tests, space)[0]
     if quick:
-        others = np.random.default_rng(0).random((STARTS - 1, space.dim))
+        others = np.tile(start, (STARTS - 1, 1))
+        others[:, : space.dim] = np.random.default_rng(0).random((STARTS - 1, space.dim))
         ends = [_descend(quick, space, place) for place in (start, *others)]
         start = min(ends, key=lambda end: end[0])[1]
     tell(progress, "simulating drapes" if len(quick) < len(tests) else "fitting")
@@ -74,7 +79,10 @@ def estimate(
         raise RuntimeError("no specimen of the drape test comes to rest: are its radii right?")
     place = jnp.asarray(end, float)
     covariance = _place_covariance(tests, space, place)
-    deviation = np.sqrt(np.diag(covariance))
+    every = np.sqrt(np.diag(covariance))
+    zeros = _zeros(tests, end[space.dim :], every[space.dim :])
+    deviation, place = every[: space.dim], place[: space.dim]
+    covariance = covariance[: space.dim, : space.dim]
     values = np.asarray(space.values(place))
     return Estimate(
         approach=APPROACH,
@@ -83,7 +91,7 @@ def estimate(
         values=values,
         standard_errors=deviation * np.array([bound.width for bound in space.ranges]),
         correlation=covariance / np.outer(deviation, deviation),
-        nuisances=(),
+        nuisances=zeros,
         loss=loss,
         losses=np.array([[loss]]),
         history=values[None, None],
@@ -139,12 +147,21 @@ def fits(tests: Sequence[Test], fabric: Fabric) -> list[Fit]:
 
 
 def _fit(test: Test, fabric: Fabric) -> Fit:
-    residuals = np.asarray(_residuals_of(test, fabric))
+    shift = 0.0
+    if isinstance(test, Pull) and test.zero_deviation > 0:
+        deviation = float(test.zero_deviation)
+
+        def squares(z: float) -> float:  # z: standard deviations
+            return float(np.sum(np.asarray(_residuals_of(test, fabric, z * deviation)) ** 2)) + z**2
+
+        shift = deviation * float(minimize_scalar(squares, bounds=(-REACH, REACH)).x)
+    residuals = np.asarray(_residuals_of(test, fabric, shift))
     errors = float(np.sqrt(np.sum(residuals**2) / test.count))
     if isinstance(test, Pull):
         most, largest = float(test.stretch.max()) - 1, float(test.tension.max())
-        share = float(test.misfit(fabric))
+        share, rest = float(test.misfit(fabric, shift)), 1e3 * (float(test.zero) + shift)
         words = f"up to {largest:.3g} N/m at {most:.1%}: off by {share:.1%} of that (rms)"
+        words += f", at rest at an extension of {rest:.3g} mm"
     elif isinstance(test, Cantilever):
         measured, expected = float(test.overhang), float(overhang(fabric, test.direction))
         words = f"overhang {1e3 * measured:.1f} mm measured, {1e3 * expected:.1f} mm expected"
@@ -156,13 +173,51 @@ def _fit(test: Test, fabric: Fabric) -> Fit:
 
 
 @eqx.filter_jit
-def _residuals_of(test: Test, fabric: Fabric) -> Array:
-    return test.residuals(fabric)
+def _residuals_of(test: Test, fabric: Fabric, shift: Array | float) -> Array:
+    shift = jnp.asarray(shift, float)
+    return test.residuals(fabric, shift) if isinstance(test, Pull) else test.residuals(fabric)
 
 
-def _residuals(u: Array, args: tuple[tuple[Test, ...], ParameterSpace]) -> Array:
+def _residuals(place: Array, args: tuple[tuple[Test, ...], ParameterSpace]) -> Array:
+    """Of all tests at a place: that of a fabric in the unit cube, then the zero of each pull, 0 to
+    1 for `REACH` standard deviations on either side."""
     tests, space = args
-    return jnp.concatenate([test.residuals(space(u)) for test in tests])
+    fabric, zeros = space(place[: space.dim]), iter(place[space.dim :])
+    shifts = [_shift(t, next(zeros)) if isinstance(t, Pull) else 0.0 for t in tests]
+    pairs = zip(tests, shifts, strict=True)
+    return jnp.concatenate([_residuals_of(test, fabric, shift) for test, shift in pairs])
+
+
+def _shift(pull: Pull, place: Any) -> Any:
+    """Of its zero [m], from 0 to 1."""
+    return (2 * place - 1) * REACH * pull.zero_deviation
+
+
+def _prior(tests: Sequence[Test], space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and precision of a place, see `_residuals`."""
+    mean, precision = (np.asarray(number, float) for number in space.prior())
+    pulls = sum(isinstance(test, Pull) for test in tests)
+    return (
+        np.append(mean, np.full(pulls, 0.5)),
+        block_diag(precision, (2 * REACH) ** 2 * np.eye(pulls)),
+    )
+
+
+def _zeros(
+    tests: Sequence[Test], places: np.ndarray, deviations: np.ndarray
+) -> tuple[Nuisance, ...]:
+    """The zero of each pull whose own is uncertain."""
+    rows = zip([t for t in tests if isinstance(t, Pull)], places, deviations, strict=True)
+    return tuple(
+        Nuisance(
+            f"zero of {pull.name.rsplit(': ', 1)[-1]}",
+            "m",
+            float(pull.zero + _shift(pull, place)),
+            float(_shift(pull, 0.5 + deviation)),
+        )
+        for pull, place, deviation in rows
+        if pull.zero_deviation > 0
+    )
 
 
 def _descend(
@@ -170,7 +225,7 @@ def _descend(
 ) -> tuple[float, np.ndarray, bool]:
     """The least squares from a start within the unit cube: the mean square of the residuals and of
     those of the prior, [-]; the place; and whether it converged."""
-    mean, precision = space.prior()
+    mean, precision = (jnp.asarray(number, float) for number in _prior(tests, space))
     low, high = MARGIN, 1 - MARGIN
     solver = BoundedGaussNewton(
         rtol=TOLERANCE, atol=TOLERANCE, low=low, high=high, mean=mean, precision=precision
@@ -179,7 +234,7 @@ def _descend(
     solution = optimistix.least_squares(
         _residuals, solver, place, args, max_steps=MAX_STEPS, throw=False
     )
-    size = len(jax.eval_shape(_residuals, place, args)) + space.dim
+    size = len(jax.eval_shape(_residuals, place, args)) + len(start)
     converged = bool(solution.result == optimistix.RESULTS.successful)
     return 2 * float(solution.stats["loss"]) / size, np.asarray(solution.value), converged
 
@@ -194,6 +249,8 @@ def _linearised(tests: tuple[Test, ...], space: ParameterSpace, u: Array):
 def _place_covariance(tests: tuple[Test, ...], space: ParameterSpace, place: Array) -> np.ndarray:
     """From tests, which count less where they scatter by more than they should, and the prior."""
     value, slope = (np.asarray(x, np.float64) for x in _linearised(tests, space, place))
-    free = sum(test.count for test in tests) - np.linalg.matrix_rank(slope)
-    scatter = max(1.0, float(value @ value) / max(int(free), 1))
-    return np.linalg.inv(slope.T @ slope / scatter + np.asarray(space.prior()[1], np.float64))
+    mean, precision = _prior(tests, space)
+    free = sum(test.count for test in tests) - np.linalg.matrix_rank(slope[:, : space.dim])
+    off = 2 * REACH * (np.asarray(place, np.float64) - mean)[space.dim :]
+    scatter = max(1.0, float(value @ value + off @ off) / max(int(free), 1))
+    return np.linalg.inv(slope.T @ slope / scatter + precision)

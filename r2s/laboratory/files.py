@@ -9,9 +9,14 @@
 ```
 
 Lengths are in metres, a direction is "warp", "weft", "bias" or an angle from the warp [rad]. The
-columns of a curve are `extension` (m, mm, cm) or `strain` (-, %), `force` (N, mN, cN, kN, gf, kgf)
-and, where the width in the middle was measured, `width`; the header says their units. A pull of
-stitch-by-stitch is one with a `file` that ends in .h5, see `read_knit`.
+columns of a curve are `extension` (m, mm, cm) or `strain` (-, %, mm/mm), `force` (N, mN, cN, kN,
+gf, kgf) and, where the width in the middle was measured, `width`, or other names that testers give
+them; see `read_choices`. A pull of stitch-by-stitch is one with a `file` that ends in .h5, see
+`read_knit`.
+
+The zero of a pull is read from its curve, and estimated. A pull may have a `pretension` [N] under
+which the strip was clamped (ISO 13934-1: 2 N up to 200 g/m^2, 5 N up to 500 g/m^2, 10 N above), or
+the extension at rest, `zero` [m], where it is known.
 """
 
 import hashlib
@@ -30,7 +35,7 @@ from r2s._util.files import parse
 from r2s.laboratory.bending import DRAPE_DEVIATION, RADII, Cantilever, Drape
 from r2s.laboratory.estimate import Test
 from r2s.laboratory.pull import SPECIMEN, Pull
-from r2s.recordings.force_log import METRES, NEWTONS, SHARES, header_of, read_columns
+from r2s.recordings.force_log import METRES, NEWTONS, SHARES, read_choices
 
 FORMAT = "r2s-laboratory/1"
 DIRECTIONS = {"warp": 0.0, "bias": math.pi / 4, "weft": math.pi / 2}
@@ -74,6 +79,8 @@ class _Pull(_Directed):
     length: float = math.nan  # a file of stitch-by-stitch has its own
     width: float = math.nan
     specimen: float = SPECIMEN
+    pretension: float | None = None
+    zero: float | None = None
 
     def read(self, folder: Path, where: str) -> list[Pull]:
         file = folder / self.file
@@ -81,14 +88,15 @@ class _Pull(_Directed):
             raise FileNotFoundError(f"{where}: no such file: {file}")
         if file.suffix == ".h5":
             return read_knit(file, self.direction, self.specimen)
-        header = " ".join(header_of(file)).lower()
-        units = {"extension": METRES} if "extension" in header else {"strain": SHARES}
-        units |= {"force": NEWTONS} | ({"width": METRES} if "width" in header else {})
-        along, force, *width = read_columns(file, units)[0].T
-        extension = along if "extension" in units else along * self.length
+        choices = [{"extension": METRES, "strain": SHARES}, {"force": NEWTONS}]
+        values, _, names = read_choices(file, choices, {"width": METRES})
+        along, force, *width = values.T
+        extension = along if names[0] == "extension" else along * self.length
         middle, name = width[0] if width else None, f"{where} ({file.name})"
         size = self.length, self.width
-        return [Pull.make(extension, force, size, self.direction, middle, self.specimen, name)]
+        given = {"pretension": self.pretension, "zero": self.zero}
+        specimen = self.specimen
+        return [Pull.make(extension, force, size, self.direction, middle, specimen, name, **given)]
 
 
 @dataclass(frozen=True)
@@ -185,5 +193,6 @@ def read_knit(path: Path | str, direction: float, specimen: float = SPECIMEN) ->
     for name, (along, across), force in zip(KNIT_PULLS, spans, forces, strict=True):
         extension, middle = (along - length) * scale, across / width * size[1]
         title = f"{path.name}: {name}"
-        pulls.append(Pull.make(extension, force, size, direction, middle, specimen, title))
+        strip = extension, force, size, direction, middle, specimen
+        pulls.append(Pull.make(*strip, title, zero=0.0))  # the notebook's
     return pulls

@@ -3,9 +3,14 @@
 The model is a strip in uniform strain with free sides: at a given stretch it contracts and shears
 so that its energy is least. Clamps hold the width: a strip four times as long as wide pulls within
 3 % of the model, a square one of an isotropic sheet within 15 %.
+
+The extension at which the strip is taut and free of force, its zero, is uncertain: pretension puts
+it before the first reading, slack after it. `rest_of` reads it from the curve, with a standard
+deviation, and an estimate moves it along with the fabric.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,7 +26,8 @@ SAMPLES = 24  # of a curve, evenly over its stretch
 SPECIMEN = 0.05  # relative, by which specimens of a fabric differ (standard deviation)
 READING = 0.02, 0.005  # of a tension: relative, and of the largest of its curve
 WIDTH = 0.02  # of a relative width
-BACK, BROKEN, PRELOAD = 0.1, 0.7, 0.15  # shares of the largest, beyond which it is no pull
+BACK, BROKEN, PRELOAD = 0.1, 0.7, 0.3  # shares of the largest, beyond which it is no pull
+PARTS, RISE = 50, 5.0  # of a curve whose start is sought; first slope: forces up to so many visible
 NEWTON = 30  # iterations at most; each is exact for a law of constant stiffness
 
 
@@ -33,6 +39,9 @@ class Pull(eqx.Module):
     - `across`: width in its middle over that at rest, [-]; NaN where it was not measured.
     - `direction`: of the pull, from the warp, [rad].
     - `specimen`: relative standard deviation between specimens of a fabric, [-].
+    - `zero`: the reading of the extension at rest, from which the stretch counts, [m];
+      `zero_deviation`: its standard deviation, [m], 0 where it is known.
+    - `length`: of the strip at rest, [m].
     - `name`: for messages.
     """
 
@@ -41,6 +50,9 @@ class Pull(eqx.Module):
     across: Float[Array, " sample"]
     direction: Float[Array, ""]
     specimen: Float[Array, ""]
+    zero: Float[Array, ""]
+    zero_deviation: Float[Array, ""]
+    length: Float[Array, ""]
     name: str = eqx.field(static=True, default="pull")
 
     @classmethod
@@ -53,13 +65,19 @@ class Pull(eqx.Module):
         width: Sequence[float] | np.ndarray | None = None,
         specimen: float = SPECIMEN,
         name: str = "pull",
+        *,
+        pretension: float | None = None,
+        zero: float | None = None,
     ) -> "Pull":
         """From what a tester writes, thinned to `SAMPLES` means over equal parts of the stretch.
 
         - `extension`, `force`: [m], [N], of a load that grows.
-        - `size`: free length between the clamps and width at rest, [m].
+        - `size`: length between the clamps where the extension counts from, and width at rest, [m].
         - `direction`: of the pull, from the warp, [rad].
         - `width`: of its middle at each sample, [m], where measured.
+        - `pretension`: force under which the strip was clamped, [N]; it is added where the tester
+          counts the force from there. None: as the force at rest shows it.
+        - `zero`: reading of the extension at rest, [m]; None: as the curve shows it, see `rest_of`.
 
         Raises `ValueError` that names the pull and what is wrong with the curve or its units.
         """
@@ -69,36 +87,59 @@ class Pull(eqx.Module):
         is_curve = extension.ndim == 1 and extension.shape == force.shape and len(force) >= 3
         expect(is_curve, f"{name}: expected three samples or more, as many forces as extensions")
         expect(0 < specimen < 1, f"{name}: specimen is a share such as 0.05, got {specimen}")
-        stretch, tension = 1 + extension / length, force / wide
         middle = np.full(len(force), np.nan) if width is None else np.asarray(width, float) / wide
-        _check(name, stretch, tension, middle)
+        expect(middle.shape == force.shape, f"{name}: as many widths as forces are needed")
+        is_force = pretension is None or 0 < pretension < np.inf
+        expect(is_force, f"{name}: a pretension is a force [N] above 0, got {pretension}")
+        _check(name, extension / length, force / wide, middle)
+        rest = Rest(zero, 0.0, 0.0) if zero is not None else rest_of(extension, force, pretension)
+        first, last = float(extension.min()), float(extension.max())
+        where = f"{name}: the zero, {rest.extension:.3g} m, is beyond all extensions"
+        expect(rest.extension < last, f"{where}: give the extension at rest [m] as 'zero'")
+        share = (first - rest.extension) / (last - rest.extension)
+        expect(
+            zero is not None or share < (PRELOAD if pretension is None else BROKEN),
+            f"{name}: at rest the force is {share:.0%} of the largest: give the 'pretension' [N] "
+            "under which the strip was clamped, or its 'zero', the extension at rest [m], or "
+            "subtract the machine's offset from the forces",
+        )
+        # the clamps are `length` apart at a reading of 0, or at the first of a machine's position
+        length += rest.extension - min(0.0, first, key=lambda at: abs(at - rest.extension))
+        stretch, tension = 1 + (extension - rest.extension) / length, (force - rest.force) / wide
         columns = _thinned(np.stack([stretch, tension, middle], axis=1))
         expect(len(columns) >= 3, f"{name}: fewer than three samples have a force above zero")
         stretches, tensions, widths = (jnp.asarray(column, float) for column in columns.T)
-        angle, spread = (jnp.asarray(number, float) for number in (direction, specimen))
-        return cls(stretches, tensions, widths, angle, spread, name)
+        numbers = direction, specimen, rest.extension, rest.deviation, length
+        scalars = (jnp.asarray(number, float) for number in numbers)
+        return cls(stretches, tensions, widths, *scalars, name=name)
 
     @property
     def count(self) -> int:
         """How many data it has: its tensions, and all widths together."""
         return self.tension.size + int(np.isfinite(np.asarray(self.across)).any())
 
-    def expected(self, fabric: Fabric) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
-        """Tension [N/m] and relative width [-] of a fabric at the stretches of the pull."""
+    def expected(
+        self, fabric: Fabric, shift: Float[Array, ""] | float = 0.0
+    ) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
+        """Tension [N/m] and relative width [-] of a fabric at the stretches of the pull, whose zero
+        is `shift` [m] later than `zero`."""
         at = jax.vmap(lambda stretch: uniaxial(fabric.membrane, stretch, self.direction))
-        return at(self.stretch)
+        return at(self.stretch / (1 + shift / self.length))
 
-    def misfit(self, fabric: Fabric) -> Float[Array, ""]:
+    def misfit(self, fabric: Fabric, shift: Float[Array, ""] | float = 0.0) -> Float[Array, ""]:
         """Root mean square of the error of the tension, over the largest of the pull, [-]."""
-        off = self.expected(fabric)[0] - self.tension
+        off = self.expected(fabric, shift)[0] - self.tension
         return jnp.sqrt(jnp.mean(off**2)) / jnp.max(self.tension)
 
-    def residuals(self, fabric: Fabric) -> Float[Array, " residual"]:
+    def residuals(
+        self, fabric: Fabric, shift: Float[Array, ""] | float = 0.0
+    ) -> Float[Array, " residual"]:
         """How far a fabric is from the curve, in standard deviations that err independently.
 
-        All tensions of a curve err together by `specimen`, and each by its `READING`.
+        All tensions of a curve err together by `specimen`, and each by its `READING`. `shift`: of
+        the zero, [m].
         """
-        expected, across = self.expected(fabric)
+        expected, across = self.expected(fabric, shift)
         alone = jnp.hypot(READING[0] * self.tension, READING[1] * jnp.max(self.tension))
         together = self.specimen * self.tension
         covariance = jnp.diag(alone**2) + together[:, None] * together[None]
@@ -140,25 +181,69 @@ def uniaxial(
     return tension, jnp.sqrt(jnp.maximum(1 + 2 * free[0], 1e-6))
 
 
-def _check(name: str, stretch: np.ndarray, tension: np.ndarray, across: np.ndarray) -> None:
+class Rest(NamedTuple):
+    """Where a pull is taut and free of force.
+
+    - `extension`, `deviation`: its reading and the standard deviation of that, [m].
+    - `force`: what the machine shows there, [N].
+    """
+
+    extension: float
+    deviation: float
+    force: float
+
+
+def rest_of(
+    extension: Float[np.ndarray, " sample"],
+    force: Float[np.ndarray, " sample"],
+    pretension: float | None = None,
+) -> Rest:
+    """The zero of a pull [m], [N] as its curve shows it.
+
+    A line through the first forces that stand out of the noise meets the force before them. If that
+    is well after the first reading, the strip was slack, and what the machine showed is its zero.
+    Else it was taut, and the line goes on to no force (or from `pretension` [N], where the machine
+    counts from there); a force below none is an offset of the machine.
+    """
+    ends = np.linspace(extension.min(), extension.max(), PARTS + 1)[1:-1]
+    d, f = _means(np.stack([extension, force], axis=1), ends).T
+    first, span, part = float(extension.min()), np.ptp(f), np.ptp(d) / PARTS
+    noise = np.median(np.abs(np.diff(f, 2))) if len(f) > 2 else 0.0  # 1.7 standard deviations
+    visible = min(max(READING[1] * span, 3 * noise), span / 10)
+    start = min(int(np.flatnonzero(f - f[0] <= visible)[-1]) + 1, len(f) - 2)
+    stop = max(start + 4, int(np.argmax(f - f[0] > RISE * visible)))
+    slope, at_none = np.polyfit(d[start:stop], f[start:stop], 1)
+    if slope <= 0:
+        slope, at_none = span / np.ptp(d), f[0] - span / np.ptp(d) * d[0]
+    taut, at_first = (f[0] - at_none) / slope, at_none + slope * first
+    shown, reach = min(at_first, 0.0), np.inf
+    if taut > first + 1.5 * part:
+        shown, reach = np.mean(f[d < taut - part / 2]), np.ptp(d[start:stop])
+    elif pretension is not None and at_first < pretension / 2:
+        shown = at_first - pretension
+    rest = (shown - at_none) / slope
+    # as far as it is extrapolated, since curves bend; and the reading error of four means
+    doubt = np.hypot(min(abs(rest - first), reach), READING[1] * span / slope / 2)
+    return Rest(float(rest), float(doubt), float(shown))
+
+
+def _check(name: str, strain: np.ndarray, tension: np.ndarray, across: np.ndarray) -> None:
     """Raise `ValueError` for a curve that is no pull or has other units."""
-    is_finite = np.isfinite(stretch).all() and np.isfinite(tension).all()
+    is_finite = np.isfinite(strain).all() and np.isfinite(tension).all()
     expect(is_finite, f"{name}: extension and force must be finite")
-    most, strongest = float(stretch.max()) - 1, float(tension.max())
+    strain = strain - strain.min()
+    most, strongest = float(strain.max()), float(tension.max())
     size = f"{name}: the strip stretches by {most:.2g} of its length at most"
     expect(most > 2e-3, f"{size}: is the extension in metres?")
     expect(most < 4, f"{size}: is the extension in per cent, or in millimetres?")
     stiffest = f"{name}: a stiffness of {strongest / most:.3g} N/m is above that of any fabric"
     expect(strongest < 2e5 * most, f"{stiffest}: is the force in grams or millinewtons?")
-    back = float(np.max(np.maximum.accumulate(stretch) - stretch)) / most
+    back = float(np.max(np.maximum.accumulate(strain) - strain)) / most
     expect(back < BACK, f"{name}: the extension goes back by {back:.0%}: leave out the unloading")
-    rises = tension[np.argmax(stretch)] > max(0.0, float(tension[np.argmin(stretch)]))
+    rises = tension[np.argmax(strain)] > max(0.0, float(tension[np.argmin(strain)]))
     expect(rises, f"{name}: the force does not rise with the extension: are columns swapped?")
-    last = tension[stretch > 1 + 0.98 * most].mean()
+    last = tension[strain > 0.98 * most].mean()
     expect(last > BROKEN * strongest, f"{name}: the force falls before the end: leave that out")
-    first = np.min(tension[stretch < 1 + 0.02 * most], initial=strongest) / strongest
-    is_loaded = PRELOAD < first < 1
-    expect(not is_loaded, f"{name}: at rest the force is {first:.0%} of the largest: subtract it")
     widths = across[np.isfinite(across)]
     expect(((widths > 0.05) & (widths < 3)).all(), f"{name}: are the widths in metres?")
 
@@ -166,6 +251,14 @@ def _check(name: str, stretch: np.ndarray, tension: np.ndarray, across: np.ndarr
 def _thinned(curve: Float[np.ndarray, "sample 3"]) -> Float[np.ndarray, "mean 3"]:
     """Means over equal parts of the stretch; what is at rest says nothing."""
     curve = curve[(curve[:, 0] > 1) & (curve[:, 1] > 0)]
-    ends = np.linspace(1, curve[:, 0].max() * (1 + 1e-9), SAMPLES + 1)
+    if not len(curve):
+        return curve
+    return _means(curve, np.linspace(1, curve[:, 0].max() * (1 + 1e-9), SAMPLES + 1))
+
+
+def _means(
+    curve: Float[np.ndarray, "sample column"], ends: Float[np.ndarray, " end"]
+) -> Float[np.ndarray, "mean column"]:
+    """Of the samples between ends of the first column, where there are some."""
     part = np.digitize(curve[:, 0], ends)
     return np.stack([curve[part == i].mean(axis=0) for i in np.unique(part)])

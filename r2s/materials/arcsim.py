@@ -65,7 +65,7 @@ def read_material(
     mass damping [1/s]. Raises `OSError`; `ValueError` that names the file, the key and what was
     expected there, or one of the arguments.
     """
-    material = read_json(path, Material)
+    material = read_json(path, Material, comments=True)
     others = (damping, friction, thickness, mass_damping)
     fabric = Fabric(
         jnp.asarray(material.density, float),

@@ -1,52 +1,98 @@
 """CSV columns with units; force logs of a stretch."""
 
+import codecs
+import contextlib
 import csv
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-NEWTONS = {"N": 1.0, "mN": 1e-3, "cN": 1e-2, "kN": 1e3, "gf": 9.80665e-3, "kgf": 9.80665}
-METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
-SHARES = {"-": 1.0, "%": 1e-2}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "sec": 1.0}
+NEWTONS = {"N": 1.0, "mN": 1e-3, "cN": 1e-2, "kN": 1e3}
+NEWTONS |= {"gf": 9.80665e-3, "kgf": 9.80665, "lbf": 4.4482216}
+METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
+SHARES = {"-": 1.0, "%": 1e-2, "mm/mm": 1.0, "m/m": 1.0}
 GRAMS = ("g", "kg", "grams", "kilograms")  # of mass: no force
+NAMES = {  # of columns in what testers export, English and German
+    "time": ("zeit", "pruefzeit", "testzeit"),
+    "force": ("load", "kraft", "standardkraft", "pruefkraft", "zugkraft"),
+    "extension": (
+        *("displacement", "elongation", "crosshead", "position", "stroke", "verschiebung", "weg"),
+        *("standardweg", "traversenweg", "dehnung", "verlaengerung", "laengenaenderung"),
+    ),
+    "strain": ("elongation", "dehnung"),
+    "width": ("breite",),
+}
+KINDS = ("tensile", "standard", "crosshead", "nominal", "engineering", "elapsed", "nominelle")
+UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})
+UNIT = r"(?P<gap>[\s_]*(?:\bin\s|[/,:])?\s*[\[(]?)\s*(?P<unit>[^\s\[\]()]*)\s*[\])]?"
+HEADER_WITHIN, LONGEST_LINE = 100, 100_000  # lines, and characters
+WORKBOOKS = b"PK\x03\x04", b"\xd0\xcf\x11\xe0"  # xlsx, xls
+Units = Mapping[str, float]
 
 
 def read_columns(
-    path: Path | str, columns: Mapping[str, Mapping[str, float]]
+    path: Path | str, columns: Mapping[str, Units]
 ) -> tuple[Float[np.ndarray, "sample column"], list[int]]:
-    """Columns of a CSV (of commas, semicolons or tabs) in SI, and the lines of the samples.
+    """Columns of a CSV in SI, and the lines of the samples: see `read_choices`."""
+    values, lines, _ = read_choices(path, [{name: units} for name, units in columns.items()])
+    return values, lines
 
-    `columns`: their names and possible units. The header says which, as in "time_s", "Force [N]" or
-    "force (mN)"; "" stands for none. Other columns, blank lines and comments (#) are skipped.
+
+def read_choices(
+    path: Path | str, choices: Sequence[Mapping[str, Units]], optional: Mapping[str, Units] = {}
+) -> tuple[Float[np.ndarray, "sample column"], list[int], list[str]]:
+    """Columns of a CSV in SI, the lines of the samples, and the names of the columns.
+
+    Of each of the `choices` (names and their possible units) the first that is there is read, then
+    what is there of `optional`. In the file a name may be one of `NAMES`, too. The header says the
+    unit, as in "time_s", "Force [N]" or "Kraft in mN", or the line below it does; "" stands for
+    none. Semicolons, tabs or commas part the columns; numbers have decimal points or commas. The
+    text is UTF-8, UTF-16 or Windows-1252. Lines before the header, other columns, blank lines and
+    comments (#) are skipped.
 
     Raises FileNotFoundError, or a ValueError that names the file and the line.
     """
-    lines = read_lines(path)
-    if not lines:
+    kept = _kept_lines(path)
+    if not kept:
         raise ValueError(f"{path}: the log is empty")
-    header = lines[0][1]
-    places = [_column(path, header, name, units) for name, units in columns.items()]
-    rows = []
-    for number, cells in lines[1:]:
+    at, delimiter = _find_header(kept, choices)
+    rows = _rows(path, kept[at:], delimiter)
+    # delimiters may end a line
+    width = max((i for i, cell in enumerate(rows[0][1], 1) if cell), default=0)
+    rows = [(n, c[:width] if not any(c[width:]) else c) for n, c in rows]
+    header, below = rows[0][1], [_bare(cell) for cell in rows[1][1]] if len(rows) > 1 else []
+    every = {u for choice in (*choices, optional) for units in choice.values() for u in units}
+    has_units = not any(map(_is_number, below)) and not every.isdisjoint(below)
+    titles = list(zip_longest(header, below if has_units else (), fillvalue=""))[: len(header)]
+    there = [{n: u} for n, u in optional.items() if _named(titles, n, u)]
+    places = [_column(path, titles, choice) for choice in (*choices, *there)]
+    samples = rows[1 + has_units :]
+    for number, cells in samples:
         if len(cells) != len(header):
             raise ValueError(
                 f"{path}: line {number} has {len(cells)} columns, the header {len(header)}: it is "
-                "cut short, or decimal commas part the columns (write decimal points)"
+                "cut short, or decimal commas part the columns (write decimal points, or part the "
+                "columns by semicolons)"
             )
-        rows.append([number_in(path, number, cells[index]) * unit for index, unit in places])
-    if len(rows) < 2:
-        raise ValueError(f"{path}: expected two samples or more, found {len(rows)}")
-    return np.array(rows), [number for number, _ in lines[1:]]
+    if len(samples) < 2:
+        raise ValueError(f"{path}: expected two samples or more, found {len(samples)}")
+    texts = _with_points(
+        path, [(n, [cells[index] for _, index, _ in places]) for n, cells in samples]
+    )
+    values = [[number_in(path, n, cell) for cell in cells] for n, cells in texts]
+    names, _, factors = zip(*places, strict=True)
+    return np.array(values) * np.array(factors), [n for n, _ in samples], list(names)
 
 
 def header_of(path: Path | str) -> list[str]:
-    """The cells of a CSV's header; none of an empty file."""
+    """The cells of a CSV's first line; none of an empty file."""
     return next((cells for _, cells in read_lines(path)), [])
 
 
@@ -55,46 +101,135 @@ def read_lines(path: Path | str) -> list[tuple[int, list[str]]]:
 
     Raises FileNotFoundError, or a ValueError that names the file.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-        lines = dict(enumerate(text.splitlines(), 1))
-        kept = {n: line for n, line in lines.items() if line.strip() and line.lstrip()[0] != "#"}
-        delimiter = max(",;\t", key=next(iter(kept.values()), "").count)
-        rows = list(csv.reader(kept.values(), delimiter=delimiter, skipinitialspace=True))
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: no text in UTF-8 ({error.reason}): export it again") from error
-    except csv.Error as error:
-        raise ValueError(f"{path}: no CSV: {error}") from error
-    if len(rows) != len(kept):
-        raise ValueError(f"{path}: a quotation mark is not closed")
-    return [(n, [c.strip() for c in row]) for n, row in zip(kept, rows, strict=True)]
+    kept = _kept_lines(path)
+    return _rows(path, kept, max(",;\t", key=kept[0][1].count) if kept else ",")
+
+
+def _kept_lines(path: Path | str) -> list[tuple[int, str]]:
+    """The lines of a text with their numbers, but for blank ones and comments (#)."""
+    data = Path(path).read_bytes()
+    if data.startswith(WORKBOOKS):
+        raise ValueError(f"{path}: a workbook, no text: save its sheet as CSV")
+    zeros = [3 * data[start::2].count(0) > len(data) > 3 for start in (0, 1)]
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encodings = ["utf-16"]
+    elif any(zeros):  # UTF-16 without a mark
+        encodings = ["utf-16-le" if zeros[1] else "utf-16-be"]
+    else:
+        encodings = ["utf-8-sig", "cp1252"]
+    for encoding in encodings:
+        with contextlib.suppress(UnicodeDecodeError):
+            lines = list(enumerate(data.decode(encoding).splitlines(), 1))
+            break
+    else:
+        raise ValueError(f"{path}: no text in UTF-8, UTF-16 or Windows-1252: export it again")
+    if any("\0" in line or len(line) > LONGEST_LINE for _, line in lines):
+        raise ValueError(f"{path}: no text: export it again")
+    return [(n, line) for n, line in lines if line.strip(" \t;,") and line.lstrip()[0] != "#"]
+
+
+def _rows(
+    path: Path | str, lines: Sequence[tuple[int, str]], delimiter: str
+) -> list[tuple[int, list[str]]]:
+    for number, line in lines:
+        if line.count('"') % 2:
+            raise ValueError(f"{path}: line {number}: a quotation mark is not closed: close it")
+    return [(number, _cells(line, delimiter)) for number, line in lines]
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    return [cell.strip() for cell in cells]
+
+
+def _find_header(
+    kept: Sequence[tuple[int, str]], choices: Sequence[Mapping[str, Units]]
+) -> tuple[int, str]:
+    """The index of the header among some lines, and what parts its columns; where none has all
+    columns, the first line of the most cells."""
+    for at, (_, line) in enumerate(kept[:HEADER_WITHIN]):
+        for delimiter in ";\t,":
+            titles = [(cell, "") for cell in _cells(line, delimiter)]
+            if all(any(_named(titles, *each) for each in c.items()) for c in choices):
+                return at, delimiter
+    counts = [max(map(line.count, ",;\t")) for _, line in kept[:HEADER_WITHIN]]
+    at = counts.index(max(counts))
+    return at, max(",;\t", key=kept[at][1].count)
+
+
+def _named(titles: Sequence[tuple[str, str]], name: str, units: Units) -> list[tuple[int, str]]:
+    """The columns of a name, with their units; `titles`: header, and the unit below it.
+
+    Columns of a known unit come first, then those of the name itself, then of its `NAMES`.
+    """
+    own, named = re.escape(name.translate(UMLAUTS)), []
+    kinds, others = "|".join(KINDS), "|".join((own, *NAMES.get(name, ())))
+    remark = r"(?:\s*\([^)]*\)(?=\s*[\[(]))?"
+    for pattern in (own, rf"(?:(?:{kinds})[\s_-]+)*(?:{others}){remark}"):
+        matches = []
+        for index, (title, below) in enumerate(titles):
+            match = re.fullmatch(pattern + UNIT, title.translate(UMLAUTS), re.IGNORECASE)
+            if match and (match["gap"] or not match["unit"] or match["unit"] in units):
+                matches.append((index, match["unit"] or below))
+        if known := [(index, unit) for index, unit in matches if unit in units]:
+            return known
+        named = named or matches
+    return named
 
 
 def _column(
-    path: Path | str, header: list[str], name: str, units: Mapping[str, float]
-) -> tuple[int, float]:
-    """The index of a column, and its unit in SI."""
-    unit_of = r"(?:[\s_]*[\[(]?\s*([\w%-]+)\s*[\])]?)?"
-    pattern = re.compile(re.escape(name) + unit_of, re.IGNORECASE)
-    matches = [(i, m[1] or "") for i, cell in enumerate(header) if (m := pattern.fullmatch(cell))]
-    if len(matches) != 1:
+    path: Path | str, titles: Sequence[tuple[str, str]], choice: Mapping[str, Units]
+) -> tuple[str, int, float]:
+    """Name, index, and unit in SI of the column that is meant."""
+    named = {name: _named(titles, name, units) for name, units in choice.items()}
+    for name, columns in named.items():
+        known = [(index, unit) for index, unit in columns if unit in choice[name]]
+        if len(known) == 1:
+            return name, known[0][0], choice[name][known[0][1]]
+        if known:
+            break
+    header = [title for title, _ in titles]
+    examples = " or ".join(f"{name!r} ({', '.join(units)})" for name, units in choice.items())
+    columns = next(filter(None, named.values()), [])
+    if len(columns) != 1:
+        name, units = next(iter(choice.items()))
         raise ValueError(
-            f"{path}: expected one column {name!r} with its unit, such as "
-            f"'{name}_{next(iter(units))}', found {len(matches)} in {header}: rename it, or name "
+            f"{path}: expected one column {examples} with its unit, such as "
+            f"'{name}_{next(iter(units))}', found {len(columns)} in {header}: rename it, or name "
             "the column that is meant"
         )
-    index, unit = matches[0]
-    if unit not in units:
-        if unit in GRAMS and "N" in units:
-            raise ValueError(
-                f"{path}: {header[index]!r} is a mass: a force is in N, or in gf where a scale "
-                "shows grams (1 gf = 9.80665 mN): name the column force_gf if it does"
-            )
+    index, unit = columns[0]
+    if unit in GRAMS and "force" in choice:
         raise ValueError(
-            f"{path}: the unit of {header[index]!r} is not known: write one of {', '.join(units)} "
-            f"into the header, as in '{name} [{next(iter(units))}]'"
+            f"{path}: {header[index]!r} is a mass: a force is in N, or in gf where a scale "
+            "shows grams (1 gf = 9.80665 mN): name the column force_gf if it does"
         )
-    return index, units[unit]
+    known = [f"{', '.join(units)} as '{n} [{next(iter(units))}]'" for n, units in choice.items()]
+    raise ValueError(
+        f"{path}: the unit of {header[index]!r} is not known: write one of {' or '.join(known)}"
+    )
+
+
+def _bare(unit: str) -> str:
+    return unit.strip("[]() ")
+
+
+def _is_number(cell: str) -> bool:
+    return re.fullmatch(r"[+-]?[\d.,]*\d[\d.,]*(?:e[+-]?\d+)?", cell, re.IGNORECASE) is not None
+
+
+def _with_points(
+    path: Path | str, lines: Sequence[tuple[int, list[str]]]
+) -> list[tuple[int, list[str]]]:
+    """Lines of numbers with decimal points, which may have had decimal commas."""
+    have = [{mark for cell in cells for mark in ",." if mark in cell} for _, cells in lines]
+    if {",", "."} <= set().union(*have):
+        at = next(at for at, marks in enumerate(have) if "," in marks)
+        raise ValueError(
+            f"{path}: line {lines[at][0]}: {lines[at][1]}: commas and points are mixed: export it "
+            "with one decimal mark, and none for thousands"
+        )
+    return [(number, [cell.replace(",", ".") for cell in cells]) for number, cells in lines]
 
 
 def number_in(path: Path | str, line: int, cell: str, what: str = "a finite number") -> float:

@@ -53,7 +53,7 @@ def read_track(path: Path, order: str = "") -> Track:
     """
     suffix = path.suffix.lower()
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file, the gripper's path")
+        raise FileNotFoundError(f"{path}: no such file, which gripper.file names")
     if suffix not in FORMATS:
         raise ValueError(f"{path}: unknown suffix {suffix!r}, expected one of {', '.join(FORMATS)}")
     try:

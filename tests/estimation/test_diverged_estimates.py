@@ -75,6 +75,29 @@ def test_cma_es_gives_no_fabric_of_runs_that_all_diverged(problem, monkeypatch):
         methods.cma_es((problem,), 30, key=jr.key(0))
 
 
+def test_the_key_alone_decides_what_cma_es_tries(problem, monkeypatch):
+    """Whatever else draws from NumPy's generator, which is left as it was."""
+    pytest.importorskip("cma")
+
+    def losses(problems, thetas):
+        np.random.standard_normal(3)  # another search
+        return jnp.sum((thetas - 0.3) ** 2, axis=1)
+
+    monkeypatch.setattr(methods, "_losses", losses)
+
+    def tried(seed):
+        return methods.cma_es((problem,), 30, key=jr.key(seed)).history
+
+    np.random.seed(7)
+    first = tried(0)
+    after = np.random.standard_normal()
+    np.random.seed(7)
+    np.random.standard_normal((len(first), 3))
+    assert after == np.random.standard_normal()
+    np.testing.assert_array_equal(first, tried(0))
+    assert not np.array_equal(first, tried(1))
+
+
 def test_a_descent_does_not_go_where_its_derivative_is_not_finite(problem):
     """However low the loss is there: it could neither go on, nor say how well that is known."""
     (start,) = row_of(problem, [1e-6])

@@ -331,6 +331,60 @@ def test_the_units_of_a_curve_are_those_of_its_header(tmp_path: Path, header, un
     assert float(pull.stretch[-1]) == pytest.approx(1.1, abs=0.005)
 
 
+EXPORTS = {
+    "preamble and units below": (
+        "cp1252",
+        '"Prüfung";"Kette"\nVorkraft;0,5;N\n\nStandardweg;Standardkraft;\nmm;N;\n{mm};{N};',
+    ),
+    "utf-16": ("utf-16", "Prüfzeit;Dehnung;Prüfkraft\ns;%;N\n0,1;{%};{N}"),
+    "utf-16 without a mark": ("utf-16-le", "Weg in mm\tKraft in mN\n{mm}\t{mN}"),
+    "quoted": (
+        "utf-8-sig",
+        '"Sample","1"\n"Time","Extension","Load"\n"(s)","(mm)","(N)"\n"0.1","{mm}","{N}"',
+    ),
+    "two strains": ("utf-8", "Tensile strain (Strain 1) (mm/mm),Tensile load [N]\n{-},{N}"),
+    "quoted decimal commas": ("utf-8", 'displacement (cm),load (N)\n"{cm}","{N}"'),
+    "both": ("utf-8", "strain_%,Displacement / mm,force_N\n{%},{mm},{N}"),
+    "a strain called elongation": ("utf-8", "sep=;\nElongation [%];Load [N]\n{%};{N}"),
+    "an extension called elongation": ("utf-8", "Elongation [mm];Force, N\n{mm};{N}"),
+}
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_what_a_tester_exports_is_read(tmp_path: Path, name: str):
+    """300 N/m up to a strain of 0.1, with decimal commas where these part no columns."""
+    encoding, text = EXPORTS[name]
+    *head, row = text.split("\n")
+    strain, is_comma = np.linspace(0, 0.1, 21), ";" in row or "\t" in row or "cm" in row
+    columns = {"-": 1, "%": 100, "mm": 200, "cm": 20, "N": 15, "mN": 15e3}
+    for value in strain:
+        line = row
+        for unit, scale in columns.items():
+            number = f"{scale * value:.5f}"
+            line = line.replace(f"{{{unit}}}", number.replace(".", ",") if is_comma else number)
+        head.append(line)
+    (tmp_path / "warp.csv").write_bytes("\n".join(head).encode(encoding))
+    (pull,) = read_tests(written(tmp_path, pulls=[PULL])).tests
+    assert isinstance(pull, Pull)
+    np.testing.assert_allclose(pull.tension, 300 * (pull.stretch - 1), rtol=1e-3)
+    assert float(pull.stretch[-1]) == pytest.approx(1.1, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    "data, words",
+    [
+        ("extension_mm;force_N\n0,5;0.1\n1,5;2", "line 2: .*commas and points are mixed"),
+        ("extension_mm,force_N\n0,5,0,1\n1,5,2,5", "part the columns by semicolons"),
+        (b"PK\x03\x04 a workbook", "save its sheet as CSV"),
+        ("extension_mm,force_N\n0,0\n1,1\nMaximum,1", "line 4: expected a finite number"),
+    ],
+)
+def test_an_export_that_cannot_be_read_is_named(tmp_path: Path, data: str | bytes, words: str):
+    (tmp_path / "warp.csv").write_bytes(data if isinstance(data, bytes) else data.encode())
+    with pytest.raises(ValueError, match=f"warp.csv: .*{words}"):
+        read_tests(written(tmp_path, pulls=[PULL]))
+
+
 @pytest.mark.parametrize(
     "header, unit, force, word",
     [
@@ -340,6 +394,10 @@ def test_the_units_of_a_curve_are_those_of_its_header(tmp_path: Path, header, un
         ("extension_m,force_N", 1, -1, "does not rise"),
         ("extension_m,force_N", 1e-3, 1, "in metres"),
         ("extension,force_N", 1, 1, "unit of 'extension'"),
+        ("Displacement,force_N", 1, 1, r"m, mm, cm, in as 'extension \[m\]' or -, %.* as 'strain"),
+        ("way_mm,force_N", 1, 1, r"column 'extension' \(m, mm, .*\) or 'strain' \(-, %"),
+        ("Strain [%],Stress [MPa]", 1, 1, r"column 'force' \(N, mN"),
+        ("stroke_mm,position_mm,force_N", 1, 1, "found 2"),
     ],
 )
 def test_a_curve_in_other_units_is_named(tmp_path: Path, header, unit, force, word):
@@ -360,6 +418,90 @@ def test_a_curve_in_other_units_is_named(tmp_path: Path, header, unit, force, wo
 def test_a_curve_that_is_no_pull_is_named(strain, force, words):
     with pytest.raises(ValueError, match=words):
         Pull.make(0.2 * np.array(strain), np.array(force, float), SIZE)
+
+
+# The zero of a pull
+
+STIFF = 8000.0  # [N/m]
+D = np.linspace(0, 0.0225, 91)  # [m]
+
+
+def straight(extension: np.ndarray) -> np.ndarray:
+    """The force [N] of a strip of `SIZE` that is taut from 0 on, with some noise."""
+    noise = np.random.default_rng(0).normal(0, 0.05, len(extension))
+    return STIFF * SIZE[1] / SIZE[0] * np.maximum(extension, 0) + noise
+
+
+@pytest.mark.parametrize("level", [2.0, 5.0, 10.0])  # [N], those of ISO 13934-1
+@pytest.mark.parametrize("is_counted", [True, False], ids=["counted", "tared"])
+def test_a_pretension_puts_the_rest_before_the_first_reading(level, is_counted):
+    before = level * SIZE[0] / SIZE[1] / STIFF
+    force = straight(D + before) - (0 if is_counted else level)
+    pull = Pull.make(D, force, SIZE, pretension=None if is_counted else level)
+    assert float(pull.zero) == pytest.approx(-before, abs=1e-4)
+    assert float(pull.zero_deviation) == pytest.approx(before, rel=0.1)
+    assert float(pull.length) == pytest.approx(SIZE[0] - before, abs=1e-4)
+    slope = np.asarray(pull.tension) / (np.asarray(pull.stretch) - 1)
+    np.testing.assert_allclose(slope[1:], STIFF, rtol=0.06)
+
+
+@pytest.mark.parametrize("offset", [-1.0, 0.0, 5.0])  # [N], of the machine
+@pytest.mark.parametrize("slack", [0.001, 0.003, 0.01])  # [m]
+def test_slack_and_the_offset_of_a_machine_are_taken_out(slack, offset):
+    pull = Pull.make(D, straight(D - slack) + offset, SIZE)
+    assert float(pull.zero) == pytest.approx(slack, abs=2e-4)
+    assert float(pull.zero_deviation) < 2e-3
+    assert float(pull.length) == pytest.approx(SIZE[0] + slack, abs=2e-4)
+
+
+@pytest.mark.parametrize("position", [-0.05, 0.02, 0.2])
+def test_a_machine_may_count_the_extension_from_anywhere(position):
+    pull = Pull.make(D + position, straight(D), SIZE)
+    assert float(pull.zero) == pytest.approx(position, abs=2e-4)
+    assert float(pull.length) == pytest.approx(SIZE[0], abs=2e-4)
+
+
+def test_a_curve_that_begins_late_keeps_its_zero():
+    late = D[20:]  # the first force is a fifth of the largest
+    pull = Pull.make(late, straight(late), SIZE)
+    assert abs(float(pull.zero)) < float(pull.zero_deviation)
+    assert float(pull.length) == pytest.approx(SIZE[0], abs=2e-4)
+
+
+def test_a_zero_that_is_given_stays():
+    pull = Pull.make(D, straight(D + 0.002), SIZE, zero=-0.002)
+    assert (float(pull.zero), float(pull.zero_deviation)) == (pytest.approx(-0.002), 0.0)
+    with pytest.raises(ValueError, match="zero, 0.5 m, is beyond"):
+        Pull.make(D, straight(D), SIZE, zero=0.5)
+    with pytest.raises(ValueError, match="pretension is a force"):
+        Pull.make(D, straight(D), SIZE, pretension=0.0)
+
+
+@pytest.mark.slow(group="study")
+@pytest.mark.parametrize("zero", [-0.0025, 0.0, 0.004], ids=["pretension", "none", "slack"])
+def test_a_zero_is_estimated_with_the_stiffness(zero):
+    """Of a fabric that pulls as its law does."""
+    fabric = Fabric.make(0.25, (STIFF, 0.0, 3000.0, 500.0), 1e-5)
+    at = jax.vmap(lambda stretch: uniaxial(fabric.membrane, stretch, 0.0)[0])
+    stretch = (SIZE[0] + D) / (SIZE[0] + zero)
+    force = SIZE[1] * np.where(stretch > 1, np.asarray(at(jnp.asarray(stretch, float))), 0)
+    pull = Pull.make(D, 1.03 * force, SIZE, name="tests.json: pull 1 (warp.csv)")
+    found = estimate([pull], on_cloth(0.25))
+    (nuisance,) = found.nuisances
+    assert nuisance.name == "zero of pull 1 (warp.csv)" and nuisance.unit == "m"
+    assert abs(nuisance.value - zero) < 2 * nuisance.standard_error < 3e-4
+    assert found.values[0] == pytest.approx(1.03 * STIFF, rel=0.02)
+    assert found.standard_errors[0] == pytest.approx(SPECIMEN, rel=0.1)
+    (fit,) = fits([pull], found.fabric)
+    assert fit.errors < 0.3 and "at rest at an extension of" in fit.words
+
+
+@pytest.mark.slow(group="study")
+def test_a_straight_line_under_pretension_is_as_stiff_as_without():
+    """The law is no straight line: it fits both alike."""
+    pulls = [Pull.make(D, straight(D + before), SIZE) for before in (0.0, 0.0025)]
+    free, under = (estimate([pull], on_cloth(0.25)).values[0] for pull in pulls)
+    assert under == pytest.approx(free, rel=0.1) and free == pytest.approx(6281, rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -404,6 +546,16 @@ def test_pulls_of_knits_are_read_in_metres(tmp_path: Path):
         del h5["video3/forces"]
     with pytest.raises(ValueError, match="no pulls of stitch-by-stitch"):
         read_knit(file, 0.0)
+
+
+@pytest.mark.parametrize("name", ["none.json", "no folder/tests.json"])
+def test_a_missing_file_is_named_without_the_number_of_the_error(tmp_path: Path, capsys, name):
+    pytest.importorskip("tyro")
+    from r2s.cli.main import main
+
+    missing = str(tmp_path / name)
+    assert main(["estimate", missing, "--density", "0.2", "--out", str(tmp_path / "a.json")]) == 1
+    assert capsys.readouterr().err == f"r2s: error: {missing}: No such file or directory\n"
 
 
 @pytest.mark.slow(group="study")

@@ -100,6 +100,17 @@ def test_an_error_names_the_file_the_key_and_what_was_expected(file, changes, me
     assert str(path) in str(error.value)
 
 
+@pytest.mark.parametrize("comment", ["// warp first", "/* two\nlines // */", "// [\n// {", ""])
+def test_comments_and_marks_of_other_programs_are_skipped(file, comment):
+    path = file(name="https://a.b/*c*/")
+    text = path.read_text().replace('"stretching"', f'{comment}\n"stretching"')
+    path.write_text(f"\ufeff{comment}\n{text} {comment}\n", encoding="utf-8")
+    assert float(read_material(path).density) == pytest.approx(0.2)
+    path.write_text(f"{comment}\n{text},", encoding="utf-8")
+    with pytest.raises(ValueError, match=f"line {2 + 2 * comment.count(chr(10)) + 1} column"):
+        read_material(path)
+
+
 @pytest.mark.parametrize("given", [{"damping": -1.0}, {"thickness": 0.0}, {"friction": -0.1}])
 def test_numbers_beside_the_file_are_checked(file, given):
     (name,) = given

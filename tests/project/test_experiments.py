@@ -5,8 +5,9 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
 from folders import ROOT
 
@@ -80,6 +81,49 @@ def test_a_folder_without_the_scenario_is_named(module, tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text('{"format": "none"}')
     with pytest.raises(ValueError, match=str(tmp_path)):
         module("_real").recordings_in(tmp_path, "lift")
+
+
+@pytest.mark.parametrize(
+    "whose, tests",
+    [
+        ([("denim", "1")], ["prior"]),
+        ([("denim", "1"), ("knit", "1")], ["prior", "other fabrics' lifts"]),
+        ([("denim", "1"), ("denim", "2"), ("knit", "1")], None),
+        ([("denim", "1"), ("denim", "2")], ["prior", "other trial"]),
+    ],
+    ids=["one", "one a fabric", "uneven", "one fabric"],
+)
+def test_folds_of_any_number_of_trials_are_compared(
+    module, tables, tmp_path: Path, monkeypatch, whose, tests
+) -> None:
+    driver = module("real_recordings")
+
+    def recording(kind: str, fabric: str, trial: str) -> SimpleNamespace:
+        name = f"{kind}_{fabric}_{trial}"
+        info = SimpleNamespace(name=name, scenario=kind, fabric=fabric, trial=trial)
+        return SimpleNamespace(info=info)
+
+    clouds = [np.zeros((2, 3))]
+    replaced = {
+        "recordings_in": lambda folder, kind: [recording(kind, *each) for each in whose],
+        "estimated": lambda *_: SimpleNamespace(fabric=None, nuisances=()),
+        "frames_of": lambda fold: range(1),
+        "cloud": lambda *_: clouds[0],
+        "errors": lambda real, others: (1.0 * len(others), 0.5),
+    }
+    for name, value in replaced.items():
+        monkeypatch.setattr(driver, name, value)
+    monkeypatch.setattr(module("_real"), "observed_of", lambda *_: clouds)
+    options = SimpleNamespace(
+        shape=(3, 3), recordings=tmp_path, kept=tmp_path, lifts_alone=False, out=tmp_path / "a.csv"
+    )
+    driver.predict_folds(options, None, [None])
+    lines, _ = tables.read(tmp_path / "a.csv")
+    assert len(lines) == len(whose) + 1
+    compared = {line["compared"] for line in tables.read(tmp_path / "a_tests.csv")[0]}
+    expected = tests or ["prior", "other fabrics' lifts", "other trial"]
+    assert {f"own lift less {other}" for other in expected} <= compared
+    assert len(compared) == 2 * len(expected)
 
 
 @pytest.mark.parametrize("name", ["diffcp-mpm-lifting", "pinn-cloth-stretching"])

@@ -1,5 +1,6 @@
 """Force logs: units, what is refused and where, the clock from the motion."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +22,15 @@ X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
         ("time (ms);force (mN)", "1500;2500", (1.5, 2.5)),
         ("time_us\tforce_kN", "1500000\t0.0025", (1.5, 2.5)),
         ("n,force_gf,extra,time_s", "9,1000,x,1.5", (1.5, 9.80665)),
+        ("Prüfzeit [s];Kraft [N]", "1,5;2,5", (1.5, 2.5)),
+        ("time_s,force_N,note", "1.5,2.5,", (1.5, 2.5)),
+        ('2" grips\ntime_s,force_N', "1.5,2.5,,", (1.5, 2.5)),
+        ("Load cell: 500 N\nTime,Load\n(sec),(N)", "1.5,2.5", (1.5, 2.5)),
+        ("Elapsed time (s)\tLoad (lbf)\t", "1.5\t2\t", (1.5, 8.8964432)),
     ],
 )
 def test_units_come_from_the_header(tmp_path: Path, header, row, expected) -> None:
-    zero = row.replace("1500000", "0").replace("1500", "0").replace("1.5", "0")
+    zero = re.sub("1500000|1500|1[.,]5", "0", row)
     (tmp_path / "pull.csv").write_text(f"# a lab\n\n{header}\n{zero}\n{row}\n")
     log = read_force_log(tmp_path / "pull.csv")
     np.testing.assert_allclose((log.times[1], log.force[1]), expected)
@@ -35,7 +41,7 @@ def test_units_come_from_the_header(tmp_path: Path, header, row, expected) -> No
     [
         ("", "the log is empty"),
         ("time_s,force_N\n0,1\n", "expected two samples or more, found 1"),
-        ("time_s,load_N\n0,1\n1,1\n", "expected one column 'force'.*found 0"),
+        ("time_s,drag_N\n0,1\n1,1\n", "expected one column 'force'.*found 0"),
         ("time_s,force_N,force_mN\n0,1,1\n", "expected one column 'force'.*found 2"),
         ("time_s,force\n0,1\n1,1\n", "unit of 'force' is not known: write one of N, mN"),
         ("time_s,force_N\n0,1\n# x\n0.2,1\n0.1,1\n", "line 5: times must.*0.2 s, then 0.1"),
@@ -45,6 +51,8 @@ def test_units_come_from_the_header(tmp_path: Path, header, row, expected) -> No
         ("time_s,force_N\n0,1\n1\n", "line 3 has 1 columns, the header 2: it is cut short"),
         ("time_s,force_N\n0,1\n0,1,2,5\n", "line 3 has 4 columns.*decimal commas"),
         (b"\xff\xfe\x00", "no text in UTF-8"),
+        (b"\x81\x8d\xff", "no text in UTF-8, UTF-16 or Windows-1252"),
+        ('time_s,force_N\n"0,1\n1,1\n', "line 2: a quotation mark is not closed"),
     ],
 )
 def test_a_broken_log_names_the_line(tmp_path: Path, text: str | bytes, words: str) -> None:

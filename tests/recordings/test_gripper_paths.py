@@ -95,5 +95,7 @@ def test_a_bad_file_is_named_with_what_is_wrong(tmp_path, name, text, words):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"lift\.csv: no such file, the gripper's path"):
+    with pytest.raises(
+        FileNotFoundError, match="no such file, which gripper.file names"
+    ):
         read_track(tmp_path / "lift.csv")

@@ -200,7 +200,7 @@ def test_a_listed_file_that_differs_or_lacks_is_warned_of(folder: Path, is_missi
         (GRIPPER[:, :2], r"gripper.npy: .*expected \(knot, 3\)"),
         (GRIPPER * np.nan, "gripper.npy: the path: 2 of 2 are not finite"),
         (GRIPPER[:, None].repeat(2, axis=1), "the path has 2 grippers, the sheet is pinned at"),
-        (None, "gripper.npy"),
+        (None, "gripper.npy: no such file, which gripper.file names"),
     ],
 )
 def test_a_bad_gripper_path_is_an_error(folder: Path, path: np.ndarray | None, words: str) -> None:

@@ -103,6 +103,28 @@ def test_a_value_that_makes_no_sense_is_named(call, error, words, unchecked):
         call()
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int64, list])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_start_takes_the_precision_of_the_solver(name, dtype, unchecked):
+    with jax.enable_x64(True):
+        sheet = r2s.rectangle((2.0, 2.0), (3, 3))
+        scene = r2s.Scene(sheet, pinned=[0])
+        grid = Grid.covering((-3, -3, -3), (5, 5, 3), 1.0)
+        solver = {
+            "implicit": lambda: r2s.ImplicitCloth(scene, 0.01),
+            "explicit": lambda: r2s.ExplicitCloth(scene, 1e-3, FABRIC),
+            "mpm": lambda: r2s.MPMCloth(scene, 1e-4, FABRIC, grid),
+        }[name]()
+        flat = np.asarray(sheet.lay_flat())
+        start = flat.tolist() if dtype is list else flat.astype(dtype)
+        state = solver.init(start, start, None)
+        expected = jax.eval_shape(solver.init, jnp.asarray(flat), jnp.asarray(flat))
+        assert jax.tree.map(lambda leaf: leaf.dtype, state) == jax.tree.map(
+            lambda leaf: leaf.dtype, expected
+        )
+        np.testing.assert_array_equal(state.x, flat)
+
+
 def test_a_start_of_other_vertices_is_named(solver):
     with pytest.raises(ValueError, match=r"x must be \(9, 3\).* got \(4, 3\)"):
         solver.init(START[:4])

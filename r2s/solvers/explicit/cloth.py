@@ -173,8 +173,7 @@ class ExplicitCloth(eqx.Module):
 
         The `acceleration` is not used.
         """
-        self.scene.check_vertices(x=x, v=v, acceleration=acceleration)
-        v = jnp.zeros_like(x) if v is None else v
+        x, v, _ = self.scene.starting(x, v, acceleration)
         return ExplicitState(x, v, *no_memory(self.scene.mesh, self.grid, x.dtype), no_failure())
 
     def step(self, fabric: Fabric, state: ExplicitState, control: Control) -> ExplicitState:

@@ -129,9 +129,7 @@ class ImplicitCloth(eqx.Module):
         The acceleration extrapolates the step before; with a wrong one the velocity lags by half a
         step's change, once and for all.
         """
-        self.scene.check_vertices(x=x, v=v, acceleration=acceleration)
-        v = jnp.zeros_like(x) if v is None else v
-        a = jnp.zeros_like(x) if acceleration is None else acceleration
+        x, v, a = self.scene.starting(x, v, acceleration)
         before = x - self.dt * v + self.dt**2 / 2 * a, v - self.dt * a
         forces = (None, None) if self.spectral_radius is None else (a, a)
         return ImplicitState(x, v, *before, no_failure(), *forces)

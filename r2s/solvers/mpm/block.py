@@ -108,8 +108,11 @@ class Block(eqx.Module):
 
         Raises `ValueError` when a particle is outside the grid, unless positions are traced.
         """
+        x = jnp.asarray(x, self.volume.dtype)
         self.background.grid.check(x)
-        v = jnp.zeros_like(x) if v is None else v
+        v = jnp.zeros_like(x) if v is None else jnp.asarray(v, x.dtype)
+        if v.shape != x.shape or len(x) != len(self.volume):
+            raise ValueError(f"{len(self.volume)} places and velocities, got {x.shape}, {v.shape}")
         identity = jnp.broadcast_to(jnp.eye(x.shape[1], dtype=x.dtype), (*x.shape, x.shape[1]))
         return BlockState(x, v, jnp.zeros_like(identity), identity, no_failure())
 

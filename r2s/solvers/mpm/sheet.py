@@ -193,9 +193,8 @@ class MPMCloth(eqx.Module):
         The `acceleration` is not used. Raises `ValueError` when a vertex is outside the grid,
         unless positions are traced.
         """
-        self.scene.check_vertices(x=x, v=v, acceleration=acceleration)
+        x, v, _ = self.scene.starting(x, v, acceleration)
         self.background.grid.check(x)
-        v = jnp.zeros_like(x) if v is None else v
         normals = jax.vmap(unit_normal)(x[self.scene.mesh.faces])
         none = jnp.zeros((*x.shape, 3), x.dtype)
         memory = no_memory(self.scene.mesh, self.cells, x.dtype)
