@@ -13,8 +13,16 @@ from jaxtyping import Float
 
 from r2s._util.files import read_json
 from r2s._util.units import positive
+from r2s.recordings.camera_fits import fit_cameras
 from r2s.recordings.cameras import is_rotation
-from r2s.recordings.clouds import READERS, find_numbered, numbers, read_cloud, read_values
+from r2s.recordings.clouds import (
+    READERS,
+    check_unit,
+    find_numbered,
+    numbers,
+    read_frames,
+    read_values,
+)
 from r2s.recordings.recording import (
     MeasurementUncertainty,
     Recording,
@@ -23,6 +31,7 @@ from r2s.recordings.recording import (
     make_recording,
 )
 from r2s.recordings.rgbd import find_rig, read_clouds, read_rig
+from r2s.recordings.strays import at_one_place
 from r2s.recordings.views import Views, shifted
 
 Vector = tuple[float, float, float]
@@ -223,14 +232,14 @@ def read_recording(
     folder = Path(folder)
     scenario_name, scenario, match = _scenario_of(manifest, name)
     path = _read_path(folder / scenario.gripper.file)
-    if find_rig(folder / name):
-        rig = read_rig(folder / name)
+    rig = read_rig(folder / name) if find_rig(folder / name) else None
+    if rig:
         times, clouds = read_clouds(folder / name, rig, scenario.frame_rate, watch)
         verified = None
     else:
         frames = list(find_numbered(folder / name, READERS, scenario.first_frame).values())
         times = np.arange(len(frames)) / scenario.frame_rate
-        clouds = [read_cloud(frame) for frame in watch(frames)]
+        clouds = read_frames(watch(frames))
         files = {f"{name}/{frame.name}": c for frame, c in zip(frames, clouds, strict=True)}
         verified = _verify(manifest.files, name, files | {scenario.gripper.file: path})
         if scenario.drop_repeats:
@@ -244,6 +253,11 @@ def read_recording(
             box = session.workspace or views.clean.workspace
             views = replace(views, clean=replace(views.clean, workspace=box))
             views = shifted(views, shift)
+    rate = scenario.frame_rate
+
+    def in_world(points: np.ndarray) -> np.ndarray:
+        return to_world(scenario.cloud, points) + np.array(shift)
+
     source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
     info = RecordingInfo(
         name=name,
@@ -258,9 +272,13 @@ def read_recording(
         time_offset=scenario.time_offset,
         doubt=scenario.doubt,
         views=views,
+        camera_fits=fit_cameras(folder / name, rig, rate, scenario.sheet, in_world) if rig else (),
     )
+    clouds = [in_world(points) for points in clouds]
+    what = f"{folder / name}: the first frame's points"
+    check_unit(what, clouds[0], scenario.sheet.size, "cloud.scale")
     return make_recording(
-        [to_world(scenario.cloud, points) + np.array(shift) for points in clouds],
+        clouds,
         times + scenario.time_offset,
         to_world(scenario.gripper.transform, path) + np.array(scenario.gripper.offset),
         np.arange(len(path)) / scenario.gripper.rate,
@@ -305,5 +323,7 @@ def _verify(listed: Mapping[str, str], name: str, values: Mapping[str, np.ndarra
 
 
 def _distinct(points: np.ndarray) -> np.ndarray:
-    _, first = np.unique(points, axis=0, return_index=True)
-    return points[np.sort(first)]
+    """One of points that are equal; all where they are too many, which `check` counts."""
+    kept = at_one_place(points)
+    kept[np.unique(points, axis=0, return_index=True)[1]] = True
+    return points[kept]

@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +24,7 @@ from r2s.recordings.manifest import (
     sources,
 )
 from r2s.recordings.recording import FORMAT, Recording, load, save
+from r2s.recordings.strays import strays, without_strays, words
 from r2s.recordings.swings import is_swing, read_swing
 
 
@@ -58,12 +60,19 @@ def open_recording(path: Path | str) -> Recording:
 
 
 def open_recordings(paths: Sequence[Path]) -> Iterator[Recording]:
-    """Read recordings of NPZ files, folders of them, or folders of frames (`open_recording`)."""
+    """Read recordings of NPZ files, folders of them, or folders of frames (`open_recording`).
+
+    Points that are no measurement of the sheet are left out, with a warning (`without_strays`).
+    """
     for path in paths:
         files = sorted(path.glob("*.npz"))
         if not files or (path / "manifest.json").exists():
             files = [path]
-        yield from map(open_recording, files)
+        for recording in map(open_recording, files):
+            recording, said = without_strays(recording)
+            if said:
+                warnings.warn(f"{recording.info.name}: {said}", stacklevel=2)
+            yield recording
 
 
 def save_trajectory(path: Path | str, x: Any, faces: Any) -> None:
@@ -160,4 +169,5 @@ def _convert_one(
     recording = read_recording(root, manifest, name, bar)
     save(recording, file)
     write_text(mark, made_from + "\n")
-    return f"{len(recording.times)} frames, {int(recording.mask.sum())} points, {file}"
+    counts = f"{len(recording.times)} frames, {int(recording.mask.sum())} points, {file}"
+    return "; ".join([counts, *words(recording, strays(recording))])

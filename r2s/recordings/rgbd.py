@@ -26,7 +26,15 @@ from scipy.spatial import KDTree
 
 from r2s._util.files import read_json
 from r2s.recordings import images
-from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved
+from r2s.recordings.cameras import (
+    RAY,
+    DepthCamera,
+    back_project,
+    depth_jumps,
+    from_world,
+    moved,
+    rays,
+)
 from r2s.recordings.clouds import Cleaning, clean, find_numbered, inside
 from r2s.recordings.force_log import check_increasing, number_in, read_lines
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
@@ -195,14 +203,9 @@ def stream(
     the extra), or ValueError that names the file or camera and frame, and what to do.
     """
     folder = Path(folder)
-    rate = rig.frame_rate or frame_rate
-    files = {name: _files(folder / name, camera) for name, camera in rig.cameras.items()}
-    times = {name: frame_times(folder / name, len(files[name]), rate) for name in rig.cameras}
-    try:
-        pairs = pair(times, rig.pair_tolerance)
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from error
-    clock = next(iter(times.values()))
+    for name, camera in rig.cameras.items():
+        _check_lens(name, camera)
+    files, clock, pairs = _paired(folder, rig, frame_rate)
     last: dict[str, bytes] = {}
     for frame, index in enumerate(next(iter(pairs.values()))):
         parts = {}
@@ -218,6 +221,46 @@ def stream(
                 f"{rig.clean.workspace} [m]: check workspace, table and masks, or drop the frame"
             )
         yield float(clock[index]), cloud
+
+
+def camera_clouds(
+    folder: Path | str, rig: Rig, frame_rate: float, count: int
+) -> list[dict[str, Float[np.ndarray, "point 3"]]]:
+    """World points [m] of each camera alone, uncleaned but for workspace and edges, in so many
+    frames of a recording, evenly chosen, the first and the last among them; raises as `stream`."""
+    files, _, pairs = _paired(Path(folder), rig, frame_rate)
+    total = len(next(iter(pairs.values())))
+    return [
+        {
+            name: _camera_cloud(rig, name, *files[name][chosen[frame]], {})
+            for name, chosen in pairs.items()
+        }
+        for frame in np.unique(np.linspace(0, total - 1, count).round().astype(int))
+    ]
+
+
+def _paired(folder: Path, rig: Rig, frame_rate: float):
+    """Files of each camera's frames, times [s] of the first, and which frames belong together."""
+    rate = rig.frame_rate or frame_rate
+    files = {name: _files(folder / name, camera) for name, camera in rig.cameras.items()}
+    times = {name: frame_times(folder / name, len(files[name]), rate) for name in rig.cameras}
+    try:
+        pairs = pair(times, rig.pair_tolerance)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from error
+    return files, next(iter(times.values())), pairs
+
+
+def _check_lens(name: str, camera: DepthCamera) -> None:
+    """Say which share of the pixels has no ray; refuse a camera where that is most of them."""
+    if lost := float(np.isnan(rays(camera)[..., 0]).mean()):
+        words = f"{name}: {lost:.1%} of the pixels see no direction by its lens and distortion"
+        if lost > MOST:
+            raise ValueError(
+                f"{NAME}: {words}: give the numbers of one calibration, in OpenCV's order, and "
+                '"lens": "fisheye" for those of cv2.fisheye'
+            )
+        warnings.warn(f"{NAME}: {words}, they are left out", stacklevel=3)
 
 
 def _files(folder: Path, camera: DepthCamera) -> list[tuple[Path, Path | None]]:
@@ -258,7 +301,10 @@ def _camera_cloud(
     camera = rig.cameras[name]
     depth = images.read_depth(depth_file, camera.depth_scale, camera.resolution)
     _warn_of_repeats(name, depth_file, depth, last)
-    where = depth > 0
+    directions = rays(camera)
+    if camera.depth_along == RAY:
+        depth = depth / np.sqrt(1 + (directions**2).sum(axis=-1))
+    where = (depth > 0) & np.isfinite(directions[..., 0])
     if mask_file is not None:
         where &= _mask(name, camera, depth_file, mask_file, where)
     if rig.clean.edge > 0:

@@ -63,9 +63,11 @@ def _boxes(
     plane = corners[..., :2] / np.maximum(z, NEAREST)[..., None]
     boxes = []
     for axis, lines in ((0, directions[..., 0].T), (1, directions[..., 1])):
-        # what a column (row) of pixels sees lies between these, made to grow from one to the next
-        low = np.minimum.accumulate(lines.min(axis=1)[::-1])[::-1]
-        high = np.maximum.accumulate(lines.max(axis=1))
+        # what a column (row) of pixels sees lies between these, made to grow from one to the next;
+        # pixels without a ray see nothing
+        least, most = (np.nan_to_num(lines, nan=value) for value in (np.inf, -np.inf))
+        low = np.minimum.accumulate(least.min(axis=1)[::-1])[::-1]
+        high = np.maximum.accumulate(most.max(axis=1))
         first = np.searchsorted(high, plane[..., axis].min(axis=1) - ROUNDING)
         last = np.searchsorted(low, plane[..., axis].max(axis=1) + ROUNDING, side="right") - 1
         boxes += [np.where(behind, 0, first), np.where(behind, len(lines) - 1, last)]
@@ -104,6 +106,26 @@ class Views:
                 f"a workspace from {low} to {high} m has no room between borders of "
                 f"{self.border:g} m"
             )
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """What one camera alone shows of the sheet at rest, and beside the others; None: not shown.
+
+    - `shift`: of the sheet that lies at rest, along warp, weft and up, from its place, [m].
+    - `turn`: of the same from its place, [degrees].
+    - `bent`: root mean square distance of its points from a plane, as read, and if the files had
+      depth along the ray instead of the axis, or the other way round, [m].
+    - `apart`: median distance from the surface that the other cameras see, as read, and if the
+      depth of all was along the other, [m].
+    """
+
+    name: str
+    depth_along: str
+    shift: tuple[float, float, float] | None = None
+    turn: float | None = None
+    bent: tuple[float, float] | None = None
+    apart: tuple[float, float] | None = None
 
 
 def shifted(views: Views, shift: Corner) -> Views:
