@@ -96,7 +96,9 @@ def test_a_method_keeps_the_contract_on_the_cloth(recording, name):
     # after two steps the searches from other starts have ended apart; 14 evaluations are not enough
     assert found.converged is False and bool(found.unsure) == (name == "diffcloud")
     assert from_json(as_json(found)).converged is False
-    words = f"not sure of the minimum: {found.unsure}" if found.unsure else "not converged: the budg"
+    words = (
+        f"not sure of the minimum: {found.unsure}" if found.unsure else "not converged: the budg"
+    )
     assert any(line.startswith("search") and f": {words}" in line for line in describe(found))
 
 
