@@ -32,9 +32,9 @@ CHECKS = {
     # clean synthetic recordings show up to 0.08 s
     "clock": ("s", -0.1, 0.1, "delay of the top of the cloud after the grippers"),
     "clock rate": ("-", 0.95, 1.05, "how fast the cameras' clock runs"),
-    "repeats": ("-", -INF, 0.0, "share of all points that are many at one place"),
-    "behind": ("-", -INF, 0.0, "share of all points that are behind the cameras"),
-    "far": ("-", -INF, 0.03, "share of all points that no sheet reaches from its grippers"),
+    "repeats": ("-", -INF, 0.0, ""),
+    "behind": ("-", -INF, 0.0, ""),
+    "far": ("-", -INF, 0.03, ""),
     "points": ("-", 150, INF, "points of a frame, thinned to 5 mm,"),
     "outliers": ("-", -INF, 0.03, "share of points that are off the sheet"),
     "grip": ("m", -INF, 0.08, "distance from a gripper to the nearest point (median over frames)"),
@@ -46,14 +46,9 @@ CHECKS = {
     "table": ("m", -0.01, 0.01, "height of the sheet at rest above the table"),
     "reach": ("-", 0.55, 1.06, "farthest point from a gripper, over how far the sheet reaches,"),
     "stretch": ("-", -INF, 1.08, "the same, over what it is at rest,"),
-    "camera depth": ("-", -INF, 1.5, ""),
+    "camera depth": ("-", -INF, 1.5, "bend of a plane, over that with the other depth_along,"),
     "camera apart": ("m", -INF, 0.005, "distance (median) from the surface of the others"),
-    "camera shift": (
-        "m",
-        -INF,
-        0.015,
-        "distance of the sheet at rest from its place",
-    ),
+    "camera shift": ("m", -INF, 0.015, "distance of the sheet at rest from its place"),
     "camera turn": ("degrees", -INF, 1.4, "the same, as an angle"),
     "markers": ("-", 0.5, 1.1, "distance of neighbouring markers over that on the sheet (95 %),"),
 }
@@ -66,7 +61,7 @@ ADVICE = {
     "grippers": "are the path in metres and its times in seconds?",
     "clock": CLOCK,
     "clock rate": CLOCK,
-    "repeats": "the camera measured nothing there: export the points that have a depth",
+    "repeats": "nothing was measured there: export the points that have a depth",
     "behind": "is their z forward? Correct the pose, or export points that have a depth",
     "far": "narrow masks or workspace, drop depths at the end of the range, correct pose or unit",
     "points": "move the cameras nearer, or widen masks and workspace",
@@ -79,7 +74,7 @@ ADVICE = {
     "table": "check table_height and the cameras' pose",
     "reach": CALIBRATION,
     "stretch": "the sheet stretches, or the cameras' scale changes with the place",
-    "camera depth": 'set "depth_along" of the camera in cameras.json to the other',
+    "camera depth": 'set its "depth_along" in cameras.json to the other of "axis" and "ray"',
     "camera apart": f"{POSE}, and depth_along",
     "camera shift": f"{POSE}; where all say the same, sheet.origin in the manifest",
     "camera turn": f"{POSE}; where all say the same, sheet.warp and sheet.weft",
@@ -113,7 +108,6 @@ EDGE = 0.015  # [m], within which a cloud may end at the sheet's border or at a 
 FACE = 0.003  # [m], thickness of the layer along a face of a box that cut the cloud
 CROWDED = 30  # points in that layer, so that a face is one
 SAME = 0.0015  # [m], within which the ends of clouds agree where a box cut them
-LEAST = 5e-4  # [m], of a distance that another is divided by
 ABOVE = 0.025  # [m] above the table, below which clouds are often cut on purpose
 # noise
 NOISE_FRAMES, NOISE_POINTS = 6, 300  # that are looked at
@@ -378,13 +372,10 @@ def _residual(recording: Recording, at: np.ndarray, tops: np.ndarray, axes: list
 
 
 def _check_strays(recording: Recording) -> list[Finding]:
-    """Shares of all points that are no measurement of the sheet, with their median place [m]."""
-    findings = []
-    for key, which in zip(("repeats", "behind", "far"), strays(recording), strict=True):
-        part, place = share(recording, which)
-        words = f"{CHECKS[key][3]}, about {place} m," if place else ""
-        findings.append(_finding(key, part, words))
-    return findings
+    """Shares of all points that are no measurement of the sheet."""
+    odd = strays(recording)
+    shares = {kind: share(recording, kind, odd) for kind in odd}
+    return [_finding(kind, part, f"{words}:") for kind, (part, words) in shares.items()]
 
 
 def _check_clouds(frames: _Frames) -> list[Finding]:
@@ -422,19 +413,10 @@ def _check_cameras(recording: Recording) -> list[Finding]:
     """What each camera alone showed when the recording was converted, as far as it did."""
     findings = []
     for fit in recording.info.camera_fits:
-        seen, along = fit.bent or fit.apart, "ray" if fit.depth_along == "axis" else "axis"
-        figures = {
-            "depth": seen and seen[0] / max(seen[1], LEAST),
-            "apart": fit.apart and fit.apart[0],
-            "shift": fit.shift and float(np.linalg.norm(fit.shift)),
-            "turn": fit.turn,
-        }
-        what = "its points from a plane" if fit.bent else "the cameras' surfaces from each other"
-        words = {"depth": f"{what} at rest, over those of depth along the {along},"}
-        for kind, figure in figures.items():
-            if figure is not None:
-                name, text = f"camera {kind} {fit.name}", words.get(kind, "")
-                findings.append(_finding(f"camera {kind}", figure, text, name))
+        for kind in ("depth", "apart", "shift", "turn"):
+            key = f"camera {kind}"
+            if (figure := getattr(fit, kind)) is not None:
+                findings.append(_finding(key, figure, name=f"{key} {fit.name}"))
                 if kind == "depth" and findings[-1].is_suspicious:
                     break  # the others follow from it
     return findings

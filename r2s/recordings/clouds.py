@@ -1,7 +1,6 @@
 """Point clouds: files, frames in folders, thinning and cleaning."""
 
 import io
-import itertools
 import re
 import warnings
 from collections.abc import Callable, Collection, Iterable
@@ -88,10 +87,10 @@ def find_numbered(
 def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
     """The points of a file, in the file's units, as float64, in the order of the file.
 
-    The suffix says the format: npy; ply (vertices); obj (vertices); xyz (three columns, or six
-    with normals or colours, parted by blanks or commas, # starts a comment); pcd (needs pypcd4);
-    e57 (all its scans, needs pye57). Points of which no number is finite are left out: so PCL and
-    Open3D write where a camera measured nothing (`read_frames` counts them).
+    The suffix says the format: npy; ply (vertices; needs trimesh); obj (vertices); xyz (three
+    columns, or six with normals or colours, parted by blanks or commas, # starts a comment); pcd
+    (needs pypcd4); e57 (all scans; needs pye57). Points of which no number is finite are left out:
+    so PCL and Open3D write where a camera measured nothing (`read_frames` counts them).
 
     Raises FileNotFoundError, ImportError (names the extra to install), or a ValueError that names
     the file and what is wrong with it.
@@ -101,16 +100,15 @@ def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
 
 def read_frames(files: Iterable[Path]) -> list[Float[np.ndarray, "point 3"]]:
     """The clouds of files, as `read_cloud`; warns, once, of points without a measurement."""
-    clouds, lost, total, folder = [], 0, 0, None
+    clouds, lost, folder = [], 0, None
     for file in files:
-        values = read_values(file)
+        values, folder = read_values(file), file.parent
         clouds.append(_returns(file, values))
-        lost, total, folder = lost + len(values) - len(clouds[-1]), total + len(values), file.parent
+        lost += len(values) - len(clouds[-1])
     if lost:
+        share = lost / (lost + sum(map(len, clouds)))
         warnings.warn(
-            f"{folder}: {lost / total:.1%} of the points are no numbers (the camera measured "
-            "nothing there): they are left out",
-            stacklevel=2,
+            f"{folder}: {share:.1%} of the points are NaN, not measured: left out", stacklevel=2
         )
     return clouds
 
@@ -138,28 +136,6 @@ def read_values(path: Path | str, dtype: type | None = np.float64) -> Num[np.nda
     except Exception as error:  # the libraries raise anything, from IndexError to their own types
         kind = path.suffix.lower()[1:]
         raise ValueError(f"{path}: cannot be read as {kind}: {error}: copy it again") from error
-
-
-UNITS = {1e-3: "millimetres", 0.01: "centimetres", 0.0254: "inches", 1e3: "metres, not in mm"}
-OTHER_UNIT = 15.0  # times the sheet's diagonal, or that part of it: no scene is seen so
-
-
-def check_unit(
-    what: str, points: Float[np.ndarray, "point 3"], size: tuple[float, float], key: str
-) -> None:
-    """Raise ValueError where points [m] extend over lengths of another order than a sheet's `size`.
-
-    `what` they are, and the `key` of the manifest to change, are named in the message.
-    """
-    low, high = np.quantile(points, [0.1, 0.9], axis=0)
-    extent, diagonal = float(np.linalg.norm(high - low)), float(np.hypot(*size))
-    ratio = extent / diagonal
-    if extent > 0 and not 1 / OTHER_UNIT < ratio < OTHER_UNIT:
-        factor = min(UNITS, key=lambda unit: abs(np.log(unit * ratio)))
-        raise ValueError(
-            f"{what} extend over {extent:.3g} m, the sheet over {diagonal:.3g} m: are they in "
-            f"{UNITS[factor]}? Multiply {key} by {factor:g}, or correct the sheet's size"
-        )
 
 
 def voxel_means(points: Float[np.ndarray, "point 3"], voxel: float) -> Float[np.ndarray, "cell 3"]:
@@ -196,49 +172,24 @@ def _read_npy(path: Path) -> np.ndarray:
     return values
 
 
-PLY_TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
-}
-
-
 def _read_ply(path: Path) -> np.ndarray:
-    # By hand: trimesh cuts vertices at the seams of textures, and fails at empty lists of faces.
-    header, _, body = path.read_bytes().partition(b"end_header")
-    words = [line.split() for line in header.decode("latin-1").splitlines()]
-    kinds = [line[1] for line in words if line[:1] == ["format"]]
-    starts = [at for at, line in enumerate(words) if line[:1] == ["element"]]
-    if words[:1] != [["ply"]] or len(kinds) != 1 or not body:
-        raise ValueError("no ply header that ends")
-    body, skipped = body.partition(b"\n")[2], 0
-    for start, end in itertools.pairwise([*starts, len(words)]):
-        count, properties = int(words[start][2]), words[start + 1 : end]
-        properties = [line[1:] for line in properties if line[:1] == ["property"]]
-        lists = [line[-1] for line in properties if line[0] == "list"]
-        names = [line[-1] for line in properties]
-        is_vertex = words[start][1] == "vertex"
-        if lists and (is_vertex or kinds != ["ascii"]):
-            raise ValueError(f"a list {lists[0]!r} up to the vertices: write vertices first")
-        if kinds != ["ascii"]:
-            order = {"binary_little_endian": "<", "binary_big_endian": ">"}[kinds[0]]
-            types = [(str(at), order + PLY_TYPES[line[0]]) for at, line in enumerate(properties)]
-            skip, skipped = skipped, skipped + count * np.dtype(types).itemsize
-        if is_vertex:
-            break
-        skipped += count if kinds == ["ascii"] else 0
-    else:
+    trimesh = require("trimesh", "study", f"{path}: clouds in ply files")
+    header, end, body = path.read_bytes().partition(b"end_header")
+    promised = re.search(rb"^element vertex (\d+)", header, re.MULTILINE)
+    if not header.startswith(b"ply") or promised is None:
         raise ValueError("no ply header that names vertices")
-    xyz = [names.index(axis) for axis in "xyz"]
-    if count < 1:
+    if int(promised[1]) == 0:
         return np.zeros(0)
-    if kinds == ["ascii"]:
-        rows = [row for row in body.splitlines() if row.strip()][skipped : skipped + count]
-        if len(rows) < count or len(rows[-1].split()) < len(names):
-            raise ValueError(f"the header promises {count} vertices, found {len(rows)}")
-        return np.loadtxt(rows, usecols=xyz, ndmin=2)
-    values = np.frombuffer(body, np.dtype(types), count, skip)
-    return np.stack([values[str(at)] for at in xyz], axis=1)
+    # trimesh stumbles over lists of nothing
+    header = re.sub(rb"element (?!vertex)\S+ 0\s*\n(property .*\n)*", b"", header)
+    # process, fix_texture: else vertices are merged and reordered, and doubled at seams of textures
+    mesh: Any = trimesh.load(
+        io.BytesIO(header + end + body), file_type="ply", process=False, fix_texture=False
+    )
+    vertices = np.asarray(getattr(mesh, "vertices", ()))
+    if len(vertices) != int(promised[1]):
+        raise ValueError(f"the header promises {int(promised[1])} vertices, found {len(vertices)}")
+    return vertices
 
 
 def _read_obj(path: Path) -> np.ndarray:
@@ -268,9 +219,8 @@ def _read_pcd(path: Path) -> np.ndarray:
 
 
 def _read_e57(path: Path) -> np.ndarray:
-    """All scans of a file, in its world; points that are marked invalid are left out."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    """All scans of a file, in its world, but for points that are marked invalid."""
+    path.open("rb").close()  # so that a missing file is named
     with require("pye57", "e57", f"{path}: clouds in e57 files").E57(str(path)) as file:
         scans = [file.read_scan(i, ignore_missing_fields=True) for i in range(file.scan_count)]
     axes = [[scan[f"cartesian{axis}"] for axis in "XYZ"] for scan in scans]

@@ -15,14 +15,7 @@ from r2s._util.files import read_json
 from r2s._util.units import positive
 from r2s.recordings.camera_fits import fit_cameras
 from r2s.recordings.cameras import is_rotation
-from r2s.recordings.clouds import (
-    READERS,
-    check_unit,
-    find_numbered,
-    numbers,
-    read_frames,
-    read_values,
-)
+from r2s.recordings.clouds import READERS, find_numbered, numbers, read_frames, read_values
 from r2s.recordings.recording import (
     MeasurementUncertainty,
     Recording,
@@ -31,7 +24,7 @@ from r2s.recordings.recording import (
     make_recording,
 )
 from r2s.recordings.rgbd import find_rig, read_clouds, read_rig
-from r2s.recordings.strays import at_one_place
+from r2s.recordings.strays import at_one_place, check_unit
 from r2s.recordings.views import Views, shifted
 
 Vector = tuple[float, float, float]
@@ -232,9 +225,10 @@ def read_recording(
     folder = Path(folder)
     scenario_name, scenario, match = _scenario_of(manifest, name)
     path = _read_path(folder / scenario.gripper.file)
-    rig = read_rig(folder / name) if find_rig(folder / name) else None
-    if rig:
-        times, clouds = read_clouds(folder / name, rig, scenario.frame_rate, watch)
+    rig, alone = None, []
+    if find_rig(folder / name):
+        rig = read_rig(folder / name)
+        times, clouds = read_clouds(folder / name, rig, scenario.frame_rate, watch, alone)
         verified = None
     else:
         frames = list(find_numbered(folder / name, READERS, scenario.first_frame).values())
@@ -253,7 +247,6 @@ def read_recording(
             box = session.workspace or views.clean.workspace
             views = replace(views, clean=replace(views.clean, workspace=box))
             views = shifted(views, shift)
-    rate = scenario.frame_rate
 
     def in_world(points: np.ndarray) -> np.ndarray:
         return to_world(scenario.cloud, points) + np.array(shift)
@@ -272,11 +265,10 @@ def read_recording(
         time_offset=scenario.time_offset,
         doubt=scenario.doubt,
         views=views,
-        camera_fits=fit_cameras(folder / name, rig, rate, scenario.sheet, in_world) if rig else (),
+        camera_fits=fit_cameras(rig.cameras, alone, scenario.sheet, in_world) if rig else (),
     )
     clouds = [in_world(points) for points in clouds]
-    what = f"{folder / name}: the first frame's points"
-    check_unit(what, clouds[0], scenario.sheet.size, "cloud.scale")
+    check_unit(folder / name, clouds[0], scenario.sheet.size)
     return make_recording(
         clouds,
         times + scenario.time_offset,

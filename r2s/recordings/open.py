@@ -24,7 +24,7 @@ from r2s.recordings.manifest import (
     sources,
 )
 from r2s.recordings.recording import FORMAT, Recording, load, save
-from r2s.recordings.strays import strays, without_strays, words
+from r2s.recordings.strays import share, strays, without_strays
 from r2s.recordings.swings import is_swing, read_swing
 
 
@@ -169,5 +169,7 @@ def _convert_one(
     recording = read_recording(root, manifest, name, bar)
     save(recording, file)
     write_text(mark, made_from + "\n")
-    counts = f"{len(recording.times)} frames, {int(recording.mask.sum())} points, {file}"
-    return "; ".join([counts, *words(recording, strays(recording))])
+    odd, said = strays(recording), f"{len(recording.times)} frames, "
+    said += f"{int(recording.mask.sum())} points, {file}"
+    shares = [share(recording, kind, odd) for kind in ("repeats", "behind")]
+    return "; ".join([said, *(words for part, words in shares if part)])

@@ -16,7 +16,7 @@ import itertools
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +26,9 @@ from scipy.spatial import KDTree
 
 from r2s._util.files import read_json
 from r2s.recordings import images
-from r2s.recordings.cameras import (
-    RAY,
-    DepthCamera,
-    back_project,
-    depth_jumps,
-    from_world,
-    moved,
-    rays,
-)
-from r2s.recordings.clouds import Cleaning, clean, find_numbered, inside
+from r2s.recordings.camera_fits import fit_cameras
+from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved, rays
+from r2s.recordings.clouds import Cleaning, clean, find_numbered, inside, voxel_means
 from r2s.recordings.force_log import check_increasing, number_in, read_lines
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
 
@@ -44,6 +37,7 @@ LONGEST = 5.0  # [s] between frames: above, times are taken for milliseconds or 
 MOST = 0.5  # of the points behind a mask: at least so many are in the workspace
 DISAGREE = 0.005  # [m]: cameras whose clouds are closer than this are not swapped
 COMPARED = 2000  # points of each cloud
+THINNED = 0.005  # [m], sides of the cubes to which a camera alone is thinned
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -175,7 +169,9 @@ def rgbd_recording(
     `info.time_offset` is added to the cameras' times. `gripper_path`, `gripper_times`, `measured`
     (force, markers) and errors are as in `make_recording`; errors also as in `stream`.
     """
-    times, clouds = read_clouds(folder, rig or read_rig(folder))
+    rig, alone = rig or read_rig(folder), []
+    times, clouds = read_clouds(folder, rig, alone=alone)
+    info = replace(info, camera_fits=fit_cameras(rig.cameras, alone, info.sheet))
     clock = times + info.time_offset
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
 
@@ -185,17 +181,19 @@ def read_clouds(
     rig: Rig,
     frame_rate: float = 0.0,
     watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+    alone: list[dict[str, Float[np.ndarray, "point 3"]]] | None = None,
 ) -> tuple[Float[np.ndarray, " frame"], list[Float[np.ndarray, "point 3"]]]:
     """Times [s] on the cameras' clock, and the cleaned clouds [m]; raises as `stream`.
 
-    Frames come through `watch`, such as a bar that shows progress.
+    Frames come through `watch`, such as a bar that shows progress. What each camera sees alone,
+    thinned, is appended to `alone`, frame by frame.
     """
-    frames = list(watch(stream(folder, rig, frame_rate)))
+    frames = list(watch(stream(folder, rig, frame_rate, alone)))
     return np.array([time for time, _ in frames]), [cloud for _, cloud in frames]
 
 
 def stream(
-    folder: Path | str, rig: Rig, frame_rate: float = 0.0
+    folder: Path | str, rig: Rig, frame_rate: float = 0.0, alone: list[Any] | None = None
 ) -> Iterator[tuple[float, Float[np.ndarray, "point 3"]]]:
     """Time [s] and cleaned cloud [m] of one frame after the other: the images of one are in memory.
 
@@ -203,10 +201,17 @@ def stream(
     the extra), or ValueError that names the file or camera and frame, and what to do.
     """
     folder = Path(folder)
+    rate = rig.frame_rate or frame_rate
+    files = {name: _files(folder / name, camera) for name, camera in rig.cameras.items()}
+    times = {name: frame_times(folder / name, len(files[name]), rate) for name in rig.cameras}
+    try:
+        pairs = pair(times, rig.pair_tolerance)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from error
+    clock = next(iter(times.values()))
+    last: dict[str, bytes] = {}
     for name, camera in rig.cameras.items():
         _check_lens(name, camera)
-    files, clock, pairs = _paired(folder, rig, frame_rate)
-    last: dict[str, bytes] = {}
     for frame, index in enumerate(next(iter(pairs.values()))):
         parts = {}
         for name, chosen in pairs.items():
@@ -214,6 +219,8 @@ def stream(
             parts[name] = _camera_cloud(rig, name, depth_file, mask_file, last)
         if frame == 0:
             _check_swapped(folder, rig, parts)
+        if alone is not None:
+            alone.append({name: voxel_means(part, THINNED) for name, part in parts.items()})
         cloud = clean(np.concatenate(list(parts.values())), rig.clean, frame)
         if len(cloud) == 0:
             raise ValueError(
@@ -223,44 +230,14 @@ def stream(
         yield float(clock[index]), cloud
 
 
-def camera_clouds(
-    folder: Path | str, rig: Rig, frame_rate: float, count: int
-) -> list[dict[str, Float[np.ndarray, "point 3"]]]:
-    """World points [m] of each camera alone, uncleaned but for workspace and edges, in so many
-    frames of a recording, evenly chosen, the first and the last among them; raises as `stream`."""
-    files, _, pairs = _paired(Path(folder), rig, frame_rate)
-    total = len(next(iter(pairs.values())))
-    return [
-        {
-            name: _camera_cloud(rig, name, *files[name][chosen[frame]], {})
-            for name, chosen in pairs.items()
-        }
-        for frame in np.unique(np.linspace(0, total - 1, count).round().astype(int))
-    ]
-
-
-def _paired(folder: Path, rig: Rig, frame_rate: float):
-    """Files of each camera's frames, times [s] of the first, and which frames belong together."""
-    rate = rig.frame_rate or frame_rate
-    files = {name: _files(folder / name, camera) for name, camera in rig.cameras.items()}
-    times = {name: frame_times(folder / name, len(files[name]), rate) for name in rig.cameras}
-    try:
-        pairs = pair(times, rig.pair_tolerance)
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from error
-    return files, next(iter(times.values())), pairs
-
-
 def _check_lens(name: str, camera: DepthCamera) -> None:
     """Say which share of the pixels has no ray; refuse a camera where that is most of them."""
-    if lost := float(np.isnan(rays(camera)[..., 0]).mean()):
-        words = f"{name}: {lost:.1%} of the pixels see no direction by its lens and distortion"
-        if lost > MOST:
-            raise ValueError(
-                f"{NAME}: {words}: give the numbers of one calibration, in OpenCV's order, and "
-                '"lens": "fisheye" for those of cv2.fisheye'
-            )
-        warnings.warn(f"{NAME}: {words}, they are left out", stacklevel=3)
+    lost = float(np.isnan(rays(camera)[..., 0]).mean())
+    words = f"{NAME}: {name}: its lens and distortion give {lost:.1%} of the pixels no direction"
+    if lost > MOST:
+        raise ValueError(f'{words}: correct them ("lens": "fisheye" for numbers of cv2.fisheye)')
+    if lost:
+        warnings.warn(f"{words}: left out", stacklevel=3)
 
 
 def _files(folder: Path, camera: DepthCamera) -> list[tuple[Path, Path | None]]:
@@ -301,10 +278,9 @@ def _camera_cloud(
     camera = rig.cameras[name]
     depth = images.read_depth(depth_file, camera.depth_scale, camera.resolution)
     _warn_of_repeats(name, depth_file, depth, last)
-    directions = rays(camera)
-    if camera.depth_along == RAY:
-        depth = depth / np.sqrt(1 + (directions**2).sum(axis=-1))
-    where = (depth > 0) & np.isfinite(directions[..., 0])
+    if camera.depth_along == "ray":
+        depth = depth / np.sqrt(1 + (rays(camera) ** 2).sum(axis=-1))
+    where = (depth > 0) & np.isfinite(rays(camera)[..., 0])
     if mask_file is not None:
         where &= _mask(name, camera, depth_file, mask_file, where)
     if rig.clean.edge > 0:

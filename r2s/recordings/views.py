@@ -110,22 +110,19 @@ class Views:
 
 @dataclass(frozen=True)
 class CameraFit:
-    """What one camera alone shows of the sheet at rest, and beside the others; None: not shown.
+    """How well what one camera alone shows fits the rest; None: it shows nothing of that.
 
-    - `shift`: of the sheet that lies at rest, along warp, weft and up, from its place, [m].
-    - `turn`: of the same from its place, [degrees].
-    - `bent`: root mean square distance of its points from a plane, as read, and if the files had
-      depth along the ray instead of the axis, or the other way round, [m].
-    - `apart`: median distance from the surface that the other cameras see, as read, and if the
-      depth of all was along the other, [m].
+    - `depth`: deviation from a plane at rest, or from the other cameras' surfaces, over the same if
+      `depth_along` was the other of axis and ray.
+    - `apart`: median distance from the other cameras' surfaces, [m].
+    - `shift`, `turn`: of the sheet that lies at rest from its place, [m] and [degrees].
     """
 
     name: str
-    depth_along: str
-    shift: tuple[float, float, float] | None = None
+    depth: float | None = None
+    apart: float | None = None
+    shift: float | None = None
     turn: float | None = None
-    bent: tuple[float, float] | None = None
-    apart: tuple[float, float] | None = None
 
 
 def shifted(views: Views, shift: Corner) -> Views:

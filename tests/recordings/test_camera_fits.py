@@ -11,14 +11,15 @@ from test_checks import PLACE, RIG, SHEET, positions
 
 from r2s._util.files import write_json
 from r2s.recordings.camera_fits import fit_cameras
-from r2s.recordings.cameras import RAY, rays, rows_of
+from r2s.recordings.cameras import rays, rows_of
 from r2s.recordings.checks import check
 from r2s.recordings.images import read_depth, write_depth
 from r2s.recordings.manifest import default_manifest, manifest_for
 from r2s.recordings.open import convert
-from r2s.recordings.recording import RecordingInfo, load, make_recording
-from r2s.recordings.rgbd import Rig
+from r2s.recordings.recording import RecordingInfo, SheetPlacement, load, make_recording
+from r2s.recordings.rgbd import Rig, read_clouds
 from r2s.recordings.synthetic_rgbd import write_rgbd
+from r2s.recordings.views import CameraFit
 
 TIMES = np.arange(3) / 10
 X = np.stack([positions(height) for height in (0.0, 0.1, 0.2)])
@@ -41,9 +42,14 @@ def left(rig: Rig = RIG, turn=(0, 0, 0), shift=(0, 0, 0)) -> Rig:
     return replace(rig, cameras=rig.cameras | {"left": moved})
 
 
+def fits_of(folder: Path, rig: Rig, sheet: SheetPlacement = PLACE) -> tuple[CameraFit, ...]:
+    read_clouds(folder, rig, alone=(alone := []))
+    return fit_cameras(rig.cameras, alone, sheet)
+
+
 def suspicious(folder: Path, rig: Rig) -> set[str]:
     """What `check` says of the cameras."""
-    fits = fit_cameras(folder, rig, 0.0, PLACE, lambda points: points)
+    fits = fits_of(folder, rig)
     info = RecordingInfo(
         *("made_up", "lift", "none", "1", "made up", (0, 2), PLACE, 0.0, None), camera_fits=fits
     )
@@ -80,9 +86,9 @@ def test_cameras_that_see_no_sheet_at_rest_are_compared_with_each_other(folder: 
         (left(turn=(2, 0, 0)), True),
         (left(shift=(0, 0, 0.02)), True),
     ):
-        for fit in fit_cameras(folder, rig, 0.0, away, lambda points: points):
-            assert fit.shift is fit.turn is fit.bent is None and fit.apart is not None
-            assert (fit.apart[0] > 0.005) == apart
+        for fit in fits_of(folder, rig, away):
+            assert fit.shift is fit.turn is None and fit.apart is not None
+            assert (fit.apart > 0.005) == apart
 
 
 def on_rays(folder: Path, to: Path, names: tuple[str, ...]) -> None:
@@ -99,7 +105,7 @@ def test_depth_along_the_ray_is_named(folder: Path, tmp_path: Path, names) -> No
     on_rays(folder, tmp_path, names)
     wrong = {f"camera depth {name}" for name in names}
     assert {name for name in suspicious(tmp_path, RIG) if "depth" in name} == wrong
-    cameras = {n: replace(c, depth_along=RAY) for n, c in RIG.cameras.items() if n in names}
+    cameras = {n: replace(c, depth_along="ray") for n, c in RIG.cameras.items() if n in names}
     right = replace(RIG, cameras=RIG.cameras | cameras)
     assert suspicious(tmp_path, right) == set()
     if len(names) == 2:  # and the other way round
@@ -121,4 +127,4 @@ def test_conversion_keeps_what_a_check_needs(tmp_path: Path) -> None:
     assert line.startswith("lift_made_1: 3 frames, ")
     findings = check(load(tmp_path / "out/lift_made_1.npz"))
     (words,) = {f.describe() for f in findings if f.check == "camera depth left"}
-    assert words.startswith("suspicious") and 'set "depth_along"' in words
+    assert words.startswith("suspicious") and 'set its "depth_along"' in words

@@ -132,7 +132,8 @@ def test_a_missing_file_is_named(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "library, suffix, extra", [("pye57", "e57", "e57"), ("pypcd4", "pcd", "pcd")]
+    "library, suffix, extra",
+    [("trimesh", "ply", "study"), ("pye57", "e57", "e57"), ("pypcd4", "pcd", "pcd")],
 )
 def test_a_missing_library_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str, suffix: str, extra: str

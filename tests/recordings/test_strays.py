@@ -11,10 +11,10 @@ from test_checks import BOX, PLACE, TIMES, height, made_up, positions, suspiciou
 from r2s.cli.main import main as cli
 from r2s.recordings.cameras import DepthCamera, look_at
 from r2s.recordings.checks import check
-from r2s.recordings.clouds import Cleaning, check_unit
+from r2s.recordings.clouds import Cleaning
 from r2s.recordings.open import convert, open_recordings
 from r2s.recordings.recording import Recording, cloud, load, save
-from r2s.recordings.strays import at_one_place, strays, without_strays
+from r2s.recordings.strays import at_one_place, check_unit, strays, without_strays
 from r2s.recordings.views import Views
 
 RNG = np.random.default_rng(0)
@@ -88,11 +88,10 @@ def test_evaluate_and_estimate_read_what_is_left_and_say_so(tmp_path: Path, caps
     save(lift(np.tile(CAMERA, (200, 1))), tmp_path / "lift.npz")
     with pytest.warns(UserWarning, match=r"made_up: left out: 40.9% of the points are many at one"):
         (recording,) = open_recordings([tmp_path / "lift.npz"])
-    assert not strays(recording).repeated.any()
+    assert not strays(recording)["repeats"].any()
     assert cli(["check", str(tmp_path / "lift.npz")]) == 1
-    assert "repeats: share of all points that are many at one place, about [0.2, -0.6, 0.8] m" in (
-        capsys.readouterr().out
-    )
+    line = "repeats: 40.9% of the points are many at one place, about [0.2, -0.6, 0.8] m: 0.409"
+    assert line in capsys.readouterr().out
 
 
 def test_conversion_says_what_is_no_measurement_also_where_repeats_are_dropped(tmp_path) -> None:
@@ -104,9 +103,11 @@ def test_conversion_says_what_is_no_measurement_also_where_repeats_are_dropped(t
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["scenarios"]["lift"]["drop_repeats"] = True
     (folder / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.warns(UserWarning, match=r"lift_camel_1: 4\.9% of the points are no numbers"):
+    with pytest.warns(
+        UserWarning, match=r"lift_camel_1: 4\.9% of the points are NaN, not measured: left out"
+    ):
         (line,) = convert(folder, tmp_path / "out")
-    assert "; 40.9% of the points are many at one place, [0.5, 0.5, 0.5] m" in line
+    assert "; 40.9% of the points are many at one place, about [0.5, 0.5, 0.5] m" in line
     assert len(cloud(load(tmp_path / "out/lift_camel_1.npz"), 0)) == 489
 
 
@@ -116,21 +117,21 @@ def test_conversion_says_what_is_no_measurement_also_where_repeats_are_dropped(t
         (1e3, r"in millimetres\? Multiply cloud.scale by 0.001"),
         (100.0, r"in centimetres\? Multiply cloud.scale by 0.01"),
         (1 / 0.0254, r"in inches\? Multiply cloud.scale by 0.0254"),
-        (1e-3, r"in metres, not in mm\? Multiply cloud.scale by 1000"),
+        (1e-3, r"in metres, not mm\? Multiply cloud.scale by 1000"),
     ],
 )
 def test_clouds_in_another_unit_are_asked_about(tmp_path: Path, factor: float, words: str) -> None:
     folder = lab(tmp_path, "lift_camel_1")
     for file, x in zip(sorted((folder / "lift_camel_1").glob("*.npy")), X, strict=False):
         np.save(file, factor * x)
-    with pytest.raises(ValueError, match=f"lift_camel_1: the first frame's points ext.*{words}"):
+    with pytest.raises(ValueError, match=f"lift_camel_1: its points ext.*{words}"):
         list(convert(folder, tmp_path / "out"))
     assert not list((tmp_path / "out").glob("*.npz"))
 
 
 @pytest.mark.parametrize("scene", [X[0], 0.3 * X[0], 8 * X[0], np.ones((5, 3))])
 def test_a_part_of_a_sheet_and_a_room_pass(scene: np.ndarray) -> None:
-    check_unit("points", scene, PLACE.size, "scale")
+    check_unit(Path("lift"), scene, PLACE.size)
 
 
 @pytest.mark.parametrize("count", [31, 41])
