@@ -11,7 +11,7 @@ from r2s.recordings.cameras import DepthCamera, from_world, moved
 from r2s.recordings.recording import SheetPlacement
 from r2s.recordings.views import CameraFit
 
-Points = Float[np.ndarray, "point 3"]
+Points = Float[np.ndarray, "_ 3"]
 
 FRAMES, FEWEST = 5, 100  # frames that are looked at; points that show something
 AROUND = 0.15  # [m] from its place in which a sheet at rest is looked for

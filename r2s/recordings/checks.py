@@ -181,6 +181,12 @@ def check(recording: Recording) -> list[Finding]:
     return sorted(findings, key=lambda finding: not finding.is_suspicious)
 
 
+def at_conversion(recording: Recording) -> list[Finding]:
+    """What shows of the files alone: points that are no measurement, and each camera."""
+    counts = [each for each in _check_strays(recording) if each.check != "far"]
+    return [*counts, *_check_cameras(recording)]
+
+
 def _lies(sheet: SheetPlacement) -> bool:
     """Whether a sheet lies at rest, rather than hangs."""
     return bool(abs(np.cross(sheet.warp, sheet.weft)[2]) > 0.9)
@@ -372,10 +378,10 @@ def _residual(recording: Recording, at: np.ndarray, tops: np.ndarray, axes: list
 
 
 def _check_strays(recording: Recording) -> list[Finding]:
-    """Shares of all points that are no measurement of the sheet."""
+    """Shares of all points that are no measurement of the sheet, where there are some."""
     odd = strays(recording)
     shares = {kind: share(recording, kind, odd) for kind in odd}
-    return [_finding(kind, part, f"{words}:") for kind, (part, words) in shares.items()]
+    return [_finding(kind, part, f"{words}:") for kind, (part, words) in shares.items() if part]
 
 
 def _check_clouds(frames: _Frames) -> list[Finding]:
@@ -403,7 +409,7 @@ def _check_clouds(frames: _Frames) -> list[Finding]:
             if axis == 2 and side < 0 and place < info.table_height + ABOVE:
                 continue  # the table, or a cut just above it
             if np.abs(edges[:, axis] - place).min() < EDGE:
-                continue  # the sheet's own border, at rest or where it is held
+                share = 0.0  # it is the sheet's own border, at rest or where it is held
             words = f"share of frames whose clouds are cut {name} {letter} = {place:.3f} m"
             findings.append(_finding("crop", share, words, f"crop {letter}"))
     return findings

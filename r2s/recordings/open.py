@@ -14,6 +14,7 @@ from jaxtyping import Float, Integer
 
 from r2s._util.extras import require
 from r2s._util.files import read_npz, write_npz, write_text
+from r2s.recordings.checks import at_conversion
 from r2s.recordings.datasets import known_bar
 from r2s.recordings.manifest import (
     Manifest,
@@ -24,7 +25,7 @@ from r2s.recordings.manifest import (
     sources,
 )
 from r2s.recordings.recording import FORMAT, Recording, load, save
-from r2s.recordings.strays import share, strays, without_strays
+from r2s.recordings.strays import without_strays
 from r2s.recordings.swings import is_swing, read_swing
 
 
@@ -169,7 +170,6 @@ def _convert_one(
     recording = read_recording(root, manifest, name, bar)
     save(recording, file)
     write_text(mark, made_from + "\n")
-    odd, said = strays(recording), f"{len(recording.times)} frames, "
-    said += f"{int(recording.mask.sum())} points, {file}"
-    shares = [share(recording, kind, odd) for kind in ("repeats", "behind")]
-    return "; ".join([said, *(words for part, words in shares if part)])
+    said = [f"{len(recording.times)} frames, {int(recording.mask.sum())} points, {file}"]
+    said += [finding.describe() for finding in at_conversion(recording) if finding.is_suspicious]
+    return "; ".join(said)

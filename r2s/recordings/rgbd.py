@@ -181,7 +181,7 @@ def read_clouds(
     rig: Rig,
     frame_rate: float = 0.0,
     watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
-    alone: list[dict[str, Float[np.ndarray, "point 3"]]] | None = None,
+    alone: list[dict[str, Float[np.ndarray, "_ 3"]]] | None = None,
 ) -> tuple[Float[np.ndarray, " frame"], list[Float[np.ndarray, "point 3"]]]:
     """Times [s] on the cameras' clock, and the cleaned clouds [m]; raises as `stream`.
 

@@ -124,7 +124,7 @@ def test_conversion_keeps_what_a_check_needs(tmp_path: Path) -> None:
     np.save(tmp_path / "in/lift_gripper.npy", np.repeat(X[:, 0], 9, axis=0))
     assert manifest_for(tmp_path / "in").scenarios["lift"].sheet == PLACE
     (line,) = convert(tmp_path / "in", tmp_path / "out")
-    assert line.startswith("lift_made_1: 3 frames, ")
+    assert line.startswith("lift_made_1: 3 frames, ") and "suspicious  camera depth left: " in line
     findings = check(load(tmp_path / "out/lift_made_1.npz"))
     (words,) = {f.describe() for f in findings if f.check == "camera depth left"}
     assert words.startswith("suspicious") and 'set its "depth_along"' in words

@@ -17,7 +17,7 @@ LENSES = {
     "five numbers": ("pinhole", (-0.3, 0.1, 1e-3, -1e-3, 0.0)),
     "rational": ("pinhole", WIDE),
     "thin prism": ("pinhole", (*WIDE, 2e-3, -1e-5, 3e-3, 1e-5)),
-    "tilted": ("pinhole", (0.1, -0.05, 1e-3, 0, 0.02, 0, 0, 0, 2e-3, -1e-3, 0, 0, 0.05, -0.03)),
+    "tilted": ("pinhole", (0.1, -0.05, 1e-3, 0.0, 0.02, *(0.0,) * 5, 1e-3, 0.0, 0.05, -0.03)),
     "fisheye": ("fisheye", (0.03, -0.01, 0.004, -0.001)),
     "ideal fisheye": ("fisheye", ()),
 }

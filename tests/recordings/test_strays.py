@@ -29,7 +29,7 @@ def lift(extra: np.ndarray, **info) -> Recording:
     return made_up(clouds, TIMES, PATH, TIMES, **info)
 
 
-VIEW = DepthCamera((160, 120), (140.0,) * 2, (79.5, 59.5), look_at(CAMERA, (0.2, 0.2, 0)), 1e-3)
+VIEW = DepthCamera((160, 120), (140.0,) * 2, (79.5, 59.5), look_at(CAMERA, (0.2, 0.2, 0.0)), 1e-3)
 VIEWS = Views((VIEW,), Cleaning(BOX))
 BEHIND = np.add(CAMERA, [0.0, -0.1, 0.1]) + RNG.normal(0, 0.01, (30, 3))
 FAR = RNG.uniform(-1, 1, (200, 3)) + [0, 9, 0]  # as depths at the end of the range
@@ -107,7 +107,10 @@ def test_conversion_says_what_is_no_measurement_also_where_repeats_are_dropped(t
         UserWarning, match=r"lift_camel_1: 4\.9% of the points are NaN, not measured: left out"
     ):
         (line,) = convert(folder, tmp_path / "out")
-    assert "; 40.9% of the points are many at one place, about [0.5, 0.5, 0.5] m" in line
+    assert (
+        "; suspicious  repeats: 40.9% of the points are many at one place, about [0.5, 0.5, 0.5] m"
+        in line
+    )
     assert len(cloud(load(tmp_path / "out/lift_camel_1.npz"), 0)) == 489
 
 
