@@ -16,9 +16,9 @@ Points = Float[np.ndarray, "_ 3"]
 FRAMES, FEWEST = 5, 100  # frames that are looked at; points that show something
 AROUND = 0.15  # [m] from its place in which a sheet at rest is looked for
 BORDER = 0.012  # [m] from the border of a sheet that is seen
-PATCH, NEAR = 9, 0.03  # points that make a piece of a surface, within so many metres
+PATCH, BESIDE = 9, 0.015  # points that make a piece of a surface; [m] from it along the surface
 COMPARED = 1500  # points of each camera
-LEAST = 5e-4  # [m], of a distance that another is divided by
+LEAST = 2e-3  # [m], of a distance that another is divided by: noise and wrinkles
 
 
 def fit_cameras(
@@ -44,7 +44,8 @@ def fit_cameras(
         if name in read[0]:
             rest, bowl = ((to_world(f[0][name]) - sheet.origin) @ axes.T for f in (read, other))
             if np.mean(np.abs(rest[:, 2]) < AROUND) > 0.9:
-                off = [_plane(points)[0] for points in (rest, bowl)]
+                if abs(axes[2, 2]) > 0.9:  # what hangs is bent by its weight
+                    off = [_plane(points)[0] for points in (rest, bowl)]
                 if camera.masks:
                     fit["shift"], fit["turn"] = _place(rest, np.array(sheet.size))
         fit["depth"] = off[0] / max(off[1], LEAST)
@@ -96,10 +97,11 @@ def _apart(frames: Sequence[Mapping[str, Points]], name: str) -> float:
         points = frame[name][:: len(frame[name]) // COMPARED + 1]
         for surface in (frame[other] for other in frame if other != name):
             gaps, which = KDTree(surface).query(points, PATCH)
-            near = gaps[:, -1] < NEAR
-            patches = surface[which[near]]
-            middles = patches.mean(axis=1, keepdims=True)
-            normals = np.linalg.svd(patches - middles, full_matrices=False)[2][:, 2]
-            distances.append(np.abs(np.sum((points[near] - middles[:, 0]) * normals, axis=1)))
-    off = np.concatenate(distances)
-    return float(np.median(off)) if len(off) >= FEWEST else np.nan
+            middles = surface[which].mean(axis=1, keepdims=True)
+            normals = np.linalg.svd(surface[which] - middles, full_matrices=False)[2][:, 2]
+            off = points - middles[:, 0]
+            across = np.abs(np.sum(off * normals, axis=1))
+            beside = np.linalg.norm(off, axis=1) ** 2 - across**2
+            distances.append(across[(beside < BESIDE**2) & (gaps[:, -1] < AROUND)])
+    every = np.concatenate(distances)
+    return float(np.median(every)) if len(every) >= FEWEST else np.nan

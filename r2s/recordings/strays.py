@@ -110,7 +110,8 @@ def without_strays(recording: Recording) -> tuple[Recording, str]:
     said = [words for kind, (part, words) in shares.items() if part > FEW * (kind == "far")]
     dropped = odd["repeats"] | odd["behind"]
     if FEW < shares["far"][0] <= MOST:
-        dropped = dropped | odd["far"]
+        others = (mask & ~dropped & ~odd["far"]).any(axis=1, keepdims=True)
+        dropped = dropped | (odd["far"] & others)
     elif shares["far"][0] > MOST:
         said[-1] += ": pose or unit is wrong, they are kept"
     if not dropped.any():

@@ -39,7 +39,7 @@ def left(rig: Rig = RIG, turn=(0, 0, 0), shift=(0, 0, 0)) -> Rig:
     pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
     pose[:3, 3] += shift
     moved = replace(rig.cameras["left"], to_world=rows_of(pose))
-    return replace(rig, cameras=rig.cameras | {"left": moved})
+    return replace(rig, cameras={**rig.cameras, "left": moved})
 
 
 def fits_of(folder: Path, rig: Rig, sheet: SheetPlacement = PLACE) -> tuple[CameraFit, ...]:
@@ -106,7 +106,7 @@ def test_depth_along_the_ray_is_named(folder: Path, tmp_path: Path, names) -> No
     wrong = {f"camera depth {name}" for name in names}
     assert {name for name in suspicious(tmp_path, RIG) if "depth" in name} == wrong
     cameras = {n: replace(c, depth_along="ray") for n, c in RIG.cameras.items() if n in names}
-    right = replace(RIG, cameras=RIG.cameras | cameras)
+    right = replace(RIG, cameras={**RIG.cameras, **cameras})
     assert suspicious(tmp_path, right) == set()
     if len(names) == 2:  # and the other way round
         assert "camera depth left" in suspicious(folder, right)

@@ -83,7 +83,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def with_left(**changes) -> dict:
     scene = rig()
-    return scene.cameras | {"left": replace(scene.cameras["left"], **changes)}
+    return {**scene.cameras, "left": replace(scene.cameras["left"], **changes)}
 
 
 def test_the_share_of_pixels_without_a_ray_is_said_and_most_are_refused(folder: Path) -> None:
@@ -103,5 +103,5 @@ def test_depth_along_the_ray_gives_the_points_of_depth_along_the_axis(folder, tm
     for file in (tmp_path / "left/depth").iterdir():
         write_depth(file, read_depth(file, 1e-3, (160, 120)) * along, 1e-4)
     on_rays = replace(scene, cameras=with_left(depth_along="ray", depth_scale=1e-4))
-    clouds = [read_clouds(*each)[1][0] for each in ((folder, scene), (tmp_path, on_rays))]
-    np.testing.assert_allclose(*clouds, atol=2e-4)
+    read, expected = (read_clouds(*each)[1][0] for each in ((tmp_path, on_rays), (folder, scene)))
+    np.testing.assert_allclose(read, expected, atol=2e-4)

@@ -29,7 +29,7 @@ def lift(extra: np.ndarray, **info) -> Recording:
     return made_up(clouds, TIMES, PATH, TIMES, **info)
 
 
-VIEW = DepthCamera((160, 120), (140.0,) * 2, (79.5, 59.5), look_at(CAMERA, (0.2, 0.2, 0.0)), 1e-3)
+VIEW = DepthCamera((160, 120), (140.0, 140.0), (79.5, 59.5), look_at(CAMERA, (0.2, 0.2, 0.0)), 1e-3)
 VIEWS = Views((VIEW,), Cleaning(BOX))
 BEHIND = np.add(CAMERA, [0.0, -0.1, 0.1]) + RNG.normal(0, 0.01, (30, 3))
 FAR = RNG.uniform(-1, 1, (200, 3)) + [0, 9, 0]  # as depths at the end of the range

@@ -134,7 +134,7 @@ for file in sorted(Path(sys.argv[1]).iterdir()):
 @pytest.mark.slow(group="documents")
 def test_what_open3d_pye57_pymeshlab_and_pypcd4_write_is_read(tmp_path: Path) -> None:
     """All of them are installed for the test, in a folder of its own."""
-    from pypcd4 import Encoding, PointCloud
+    from pypcd4.pypcd4 import Encoding, PointCloud
 
     points = np.random.default_rng(0).uniform(-1, 1, (6, 3))
     np.save(tmp_path / "points.npy", points)
