@@ -178,7 +178,8 @@ def _undistorted(
     rises = np.append(np.diff(radius) > 0, False)
     end = int(rises.argmin()) + 1
     size = np.linalg.norm(seen, axis=1, keepdims=True)
-    places = seen * np.interp(size, radius[:end], slope[:end]) / np.maximum(size, 1e-12)
+    start = np.minimum(np.interp(size, radius[:end], slope[:end]), 0.97 * slope[end - 1])
+    places = seen * start / np.maximum(size, 1e-12)  # not at the end, where derivatives vanish
     good, left = np.zeros(len(seen), bool), np.arange(len(seen))
     with np.errstate(all="ignore"):  # what diverges is not good
         for _ in range(STEPS):

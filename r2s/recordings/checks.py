@@ -49,7 +49,7 @@ CHECKS = {
     "camera depth": ("-", -INF, 1.5, "bend of a plane, over that with the other depth_along,"),
     "camera apart": ("m", -INF, 0.008, "distance (median) from the surface of the others"),
     "camera shift": ("m", -INF, 0.015, "distance of the sheet at rest from its place"),
-    "camera turn": ("degrees", -INF, 1.4, "the same, as an angle"),
+    "camera turn": ("degrees", -INF, 1.4, "angle between the sheet at rest and its place"),
     "markers": ("-", 0.5, 1.1, "distance of neighbouring markers over that on the sheet (95 %),"),
 }
 CALIBRATION = "check the cameras' calibration and depth scale, and the sheet's size"
