@@ -16,8 +16,10 @@ class Check:
 
     Looks at the scale, gravity and table where the whole sheet is seen at rest, at how far points
     are from the grippers, whether markers or the whole sheet stretch, the frames' times, how late
-    the top of the cloud follows the grippers, the number of points, outliers, and crops. What a
-    recording does not show is said to be not shown. Exit code 1 when something is suspicious.
+    the top of the cloud follows the grippers, the number of points, outliers, and crops; at points
+    at one place or behind the cameras, where nothing was measured; and whether each depth camera
+    fits the sheet at rest and the others. What a recording does not show is said to be not shown.
+    Exit code 1 when something is suspicious.
 
         r2s check recordings/lift_tan
         r2s check lift.npz --json

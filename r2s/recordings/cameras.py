@@ -15,7 +15,7 @@ from r2s._util.units import positive
 
 Row = tuple[float, float, float, float]
 
-DISTORTIONS = (0, 4, 5, 8, 12, 14)  # OpenCV's models: how many numbers each has
+LENSES = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (0, 4)}  # OpenCV's, and their numbers
 OFF_CENTRE = 0.2  # of the image's size: a lens's axis is closer to the middle than this
 FARTHEST = 50.0  # [m]: no camera of a fabric stands farther from the origin
 IN_MILLIMETRES = "give metres per unit of the depth files: 0.001 for millimetres, 1 for metres"
@@ -30,10 +30,12 @@ class DepthCamera:
     - `to_world`: rows of the 4 x 4 matrix from the camera's axes to the world's, [m].
     - `depth_scale`: metres per unit of the depth files.
     - `distortion`: OpenCV's k1, k2, p1, p2, k3, ...; empty for none.
+    - `lens`: "pinhole", also with the rational, thin prism and tilted models, by the number of
+      `distortion`; or "fisheye" (OpenCV's `cv2.fisheye`, k1 to k4).
+    - `depth_along`: "axis" where files have the distance along z, as depth cameras give it; "ray"
+      where they have the distance from the camera, as some simulators do.
     - `masks`: is there a folder of masks (else every pixel may be the fabric)?
     - `may_miss`: may the fabric be out of this camera's view in some frames?
-
-    Depth is the distance along z, not along the ray.
     """
 
     resolution: tuple[int, int]
@@ -44,6 +46,8 @@ class DepthCamera:
     distortion: tuple[float, ...] = ()
     masks: bool = True
     may_miss: bool = False
+    lens: str = "pinhole"
+    depth_along: str = "axis"
 
     def __post_init__(self) -> None:
         positive("pixel", resolution=min(self.resolution), focal_length=min(self.focal_length))
@@ -51,9 +55,14 @@ class DepthCamera:
             raise ValueError(
                 f"depth_scale must be positive, found {self.depth_scale}: {IN_MILLIMETRES}"
             )
-        if len(self.distortion) not in DISTORTIONS:
+        if self.lens not in LENSES:
+            raise ValueError(f"lens must be one of {list(LENSES)}, found {self.lens!r}")
+        if self.depth_along not in ("axis", "ray"):
+            raise ValueError(f"depth_along must be 'axis' or 'ray', found {self.depth_along!r}")
+        if len(self.distortion) not in LENSES[self.lens]:
             raise ValueError(
-                f"distortion has one of {DISTORTIONS} numbers, found {self.distortion}"
+                f"distortion of a {self.lens} lens has one of {LENSES[self.lens]} numbers, found "
+                f"{self.distortion}"
             )
         size = np.array(self.resolution)
         if (np.abs(np.array(self.centre) / size - 0.5) > OFF_CENTRE).any():
@@ -110,21 +119,81 @@ def matrix(camera: DepthCamera) -> Float[np.ndarray, "3 3"]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
+INVERTED = 0.01  # [pixel], within which a pixel's ray is seen in that pixel
+WIDEST = np.radians(88.0)  # from the axis: beyond, x / z says little
+BLOCK = 50_000  # pixels that are inverted at once: derivatives take 400 bytes each
+STEPS = 30  # of Newton's method, at most
+
+
 @lru_cache(maxsize=8)  # the same for every frame; 15 MB at 720p
 def rays(camera: DepthCamera) -> Float[np.ndarray, "down across 2"]:
-    """x / z and y / z of what each pixel sees, in the camera's axes: undistorted.
+    """x / z and y / z of what each pixel sees, in the camera's axes: undistorted, to `INVERTED`.
 
-    The image itself is left alone: interpolation would make depths between fabric and table.
+    NaN where the lens has no inverse, or looks more than `WIDEST` aside. The image itself is left
+    alone: interpolation would make depths between fabric and table.
     """
     columns, rows = (np.arange(size, dtype=float) for size in camera.resolution)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
     directions = (pixels - camera.centre) / camera.focal_length
-    if any(camera.distortion):
-        cv2 = require("cv2", "camera", "lens distortion")
-        lens = matrix(camera), np.array(camera.distortion)
-        directions = cv2.undistortPoints(pixels.reshape(-1, 1, 2), *lens).reshape(pixels.shape)
+    if any(camera.distortion) or camera.lens == "fisheye":
+        blocks = np.array_split(directions.reshape(-1, 2), directions.size // 2 // BLOCK + 1)
+        parts = [_undistorted(camera, block) for block in blocks]
+        directions = np.concatenate(parts).reshape(directions.shape)
     directions.setflags(write=False)
     return directions
+
+
+def project(camera: DepthCamera, points: Float[np.ndarray, "*_ 3"]) -> Float[np.ndarray, "*_ 2"]:
+    """The pixel (across, down), lens included, of points in the camera's axes [m], before it."""
+    flat = (points[..., :2] / points[..., 2:]).reshape(-1, 2)
+    if any(camera.distortion) or camera.lens == "fisheye":
+        flat = _distorted(camera, flat, camera.distortion)[0]
+    return flat.reshape(*points.shape[:-1], 2) * camera.focal_length + camera.centre
+
+
+def _distorted(
+    camera: DepthCamera, places: Float[np.ndarray, "place 2"], distortion: tuple[float, ...]
+) -> tuple[Float[np.ndarray, "place 2"], Float[np.ndarray, "place 2 2"]]:
+    """Where a lens puts x / z and y / z, for a focal length of 1, and the derivatives."""
+    cv2 = require("cv2", "camera", "lens distortion")
+    # derivatives by a shift come after focal length, centre, distortion and turn, or after the turn
+    model, shift = (cv2.fisheye, 11) if camera.lens == "fisheye" else (cv2, 3)
+    points, still = np.column_stack([places, np.ones(len(places))])[:, None], np.zeros((3, 1))
+    numbers = np.array(distortion or (0.0,) * 4)
+    put, slopes = model.projectPoints(points, still, still, np.eye(3), numbers)[:2]
+    return put.reshape(-1, 2), slopes[:, shift : shift + 2].reshape(-1, 2, 2)
+
+
+def _undistorted(
+    camera: DepthCamera, seen: Float[np.ndarray, "place 2"]
+) -> Float[np.ndarray, "place 2"]:
+    """The inverse of `_distorted`, on the branch of the centre, by Newton's method; NaN: none.
+
+    It starts from the inverse of the radial part, which is a function of one number.
+    """
+    slope, numbers = np.tan(np.linspace(0, WIDEST, 4000)), camera.distortion
+    if camera.lens == "pinhole":  # 2, 3: tangential; 8 and on: thin prism and tilt
+        numbers = tuple(0.0 if i in (2, 3) or i > 7 else k for i, k in enumerate(numbers))
+    radius = _distorted(camera, np.column_stack([slope, 0 * slope]), numbers)[0][:, 0]
+    rises = np.append(np.diff(radius) > 0, False)
+    end = int(rises.argmin()) + 1
+    size = np.linalg.norm(seen, axis=1, keepdims=True)
+    start = np.minimum(np.interp(size, radius[:end], slope[:end]), 0.97 * slope[end - 1])
+    places = seen * start / np.maximum(size, 1e-12)  # not at the end, where derivatives vanish
+    good, left = np.zeros(len(seen), bool), np.arange(len(seen))
+    with np.errstate(all="ignore"):  # what diverges is not good
+        for _ in range(STEPS):
+            put, slopes = _distorted(camera, places[left], camera.distortion)
+            off, ((a, b), (c, d)) = (put - seen[left]).T, slopes.transpose(1, 2, 0)
+            det = a * d - b * c
+            miss = np.hypot(*(off.T * camera.focal_length).T)
+            good[left] = (miss < INVERTED / 1e3) & (det > 0)
+            step = np.stack([d * off[0] - b * off[1], a * off[1] - c * off[0]]) / det
+            places[left] -= np.where(good[left], 0, np.clip(step, -1, 1)).T
+            if not len(left := left[~good[left]]):
+                break
+        good &= np.linalg.norm(places, axis=1) <= slope[end - 1]
+    return np.where(good[:, None], places, np.nan)
 
 
 def depth_jumps(

@@ -19,18 +19,22 @@ from r2s.recordings.recording import (
     corner,
     gripper_positions,
 )
+from r2s.recordings.strays import BEYOND, reach, share, strays, without_strays
 
 Points = Float[np.ndarray, "point 3"]
 
 INF = np.inf
 # unit, between which figures it is expected, what the figure is
 CHECKS = {
-    "frames": ("-", -INF, 0.05, "largest deviation from an even interval"),
+    "frames": ("-", -INF, 5.0, "longest gap between frames over the usual one"),
     "rate": ("Hz", 1.0, 240.0, "frames a second"),
     "grippers": ("m/s", -INF, 5.0, "greatest speed of a gripper"),
     # clean synthetic recordings show up to 0.08 s
     "clock": ("s", -0.1, 0.1, "delay of the top of the cloud after the grippers"),
     "clock rate": ("-", 0.95, 1.05, "how fast the cameras' clock runs"),
+    "repeats": ("-", -INF, 0.0, ""),
+    "behind": ("-", -INF, 0.0, ""),
+    "far": ("-", -INF, 0.03, ""),
     "points": ("-", 150, INF, "points of a frame, thinned to 5 mm,"),
     "outliers": ("-", -INF, 0.03, "share of points that are off the sheet"),
     "grip": ("m", -INF, 0.08, "distance from a gripper to the nearest point (median over frames)"),
@@ -42,16 +46,24 @@ CHECKS = {
     "table": ("m", -0.01, 0.01, "height of the sheet at rest above the table"),
     "reach": ("-", 0.55, 1.06, "farthest point from a gripper, over how far the sheet reaches,"),
     "stretch": ("-", -INF, 1.08, "the same, over what it is at rest,"),
+    "camera depth": ("-", -INF, 1.5, "bend of a plane, over that with the other depth_along,"),
+    "camera apart": ("m", -INF, 0.008, "distance (median) from the surface of the others"),
+    "camera shift": ("m", -INF, 0.015, "distance of the sheet at rest from its place"),
+    "camera turn": ("degrees", -INF, 1.4, "angle between the sheet at rest and its place"),
     "markers": ("-", 0.5, 1.1, "distance of neighbouring markers over that on the sheet (95 %),"),
 }
 CALIBRATION = "check the cameras' calibration and depth scale, and the sheet's size"
 CLOCK = "check the frame rate and time_offset: does a clap or a jerk come at one time in both?"
+POSE = "correct its to_world in cameras.json"
 ADVICE = {
-    "frames": "frames were dropped, or their times are not their own: resample them",
+    "frames": "many frames in a row were dropped, or times are not their own",
     "rate": "are times in seconds?",
     "grippers": "are the path in metres and its times in seconds?",
     "clock": CLOCK,
     "clock rate": CLOCK,
+    "repeats": "nothing was measured there: export the points that have a depth",
+    "behind": "is their z forward? Correct the pose, or export points that have a depth",
+    "far": "narrow masks or workspace, drop depths at the end of the range, correct pose or unit",
     "points": "move the cameras nearer, or widen masks and workspace",
     "outliers": "clean masks, or narrow the workspace",
     "grip": "the frames of cameras and grippers differ, or the clock does",
@@ -62,6 +74,10 @@ ADVICE = {
     "table": "check table_height and the cameras' pose",
     "reach": CALIBRATION,
     "stretch": "the sheet stretches, or the cameras' scale changes with the place",
+    "camera depth": 'set its "depth_along" in cameras.json to the other of "axis" and "ray"',
+    "camera apart": f"{POSE}, and depth_along",
+    "camera shift": f"{POSE}; where all say the same, sheet.origin in the manifest",
+    "camera turn": f"{POSE}; where all say the same, sheet.warp and sheet.weft",
     "markers": "the sheet stretches, or markers were taken for others",
 }
 
@@ -88,7 +104,7 @@ MOVES = 0.05  # [m], at least, along an axis that is compared
 UP = 0.1  # [m] above the table: a sheet that is held up
 # clouds
 NEIGHBOURS, DEVIATIONS = 8, 6.0  # beyond which a point is alone
-BEYOND = 1.15  # of how far the sheet reaches: no point of it is there
+EDGE = 0.015  # [m], within which a cloud may end at the sheet's border or at a gripper
 FACE = 0.003  # [m], thickness of the layer along a face of a box that cut the cloud
 CROWDED = 30  # points in that layer, so that a face is one
 SAME = 0.0015  # [m], within which the ends of clouds agree where a box cut them
@@ -144,7 +160,13 @@ class _Frames(NamedTuple):
 
 
 def check(recording: Recording) -> list[Finding]:
-    """All findings of a recording, the suspicious ones first."""
+    """All findings of a recording, the suspicious ones first.
+
+    Points that are no measurement of the sheet are counted before clouds are thinned; the others,
+    those that `evaluate` and `estimate` look at, show the rest.
+    """
+    counts = _check_strays(recording)
+    recording = without_strays(recording)[0]
     thinned = [voxel_means(cloud(recording, f), VOXEL) for f in range(len(recording.times))]
     sparse = clouds_are_markers(recording)
     clouds = thinned if sparse else [_pieces(points) for points in thinned]
@@ -155,8 +177,14 @@ def check(recording: Recording) -> list[Finding]:
     frames = _Frames(recording, thinned, clouds, gripper_positions(recording), still)
     findings = [*_check_sheet(frames), *_check_clock(frames)]
     if not sparse:
-        findings += _check_clouds(frames)
+        findings += [*counts, *_check_clouds(frames), *_check_cameras(recording)]
     return sorted(findings, key=lambda finding: not finding.is_suspicious)
+
+
+def at_conversion(recording: Recording) -> list[Finding]:
+    """What shows of the files alone: points that are no measurement, and each camera."""
+    counts = [each for each in _check_strays(recording) if each.check != "far"]
+    return [*counts, *_check_cameras(recording)]
 
 
 def _lies(sheet: SheetPlacement) -> bool:
@@ -228,12 +256,12 @@ def _seen_share(flat: Float[np.ndarray, "point 2"], size: tuple[float, float]) -
 def _extents(frames: _Frames) -> list[Finding]:
     """How far points are from the grippers, over how far the sheet reaches from there."""
     sheet = frames.recording.info.sheet
-    reach = [_reach(sheet, name) for name in sheet.pinned]
+    farthest = [reach(sheet, name) for name in sheet.pinned]
     ratios = np.full(len(frames.clouds), np.nan)
     for frame, (points, grippers) in enumerate(zip(frames.clouds, frames.grippers, strict=True)):
         if len(points) >= FEWEST:
             away = np.linalg.norm(points[:, None] - grippers[None], axis=-1)
-            ratios[frame] = np.max(np.quantile(away, 1 - ENDS, axis=0) / reach)
+            ratios[frame] = np.max(np.quantile(away, 1 - ENDS, axis=0) / farthest)
     if np.isnan(ratios).all():
         return [_finding("reach", np.nan, f"no frame has {FEWEST} points")]
     largest, *others = sorted(ratios[np.isfinite(ratios)], reverse=True)
@@ -245,11 +273,6 @@ def _extents(frames: _Frames) -> list[Finding]:
     else:
         stretch = _finding("stretch", np.nan, "not seen whole at rest")
     return [_finding("reach", most), stretch]
-
-
-def _reach(sheet: SheetPlacement, held: str) -> float:
-    """How far the farthest corner is from a corner that is held, [m]."""
-    return max(float(np.linalg.norm(corner(sheet, c) - corner(sheet, held))) for c in CORNERS)
 
 
 def _marker_distances(recording: Recording) -> Finding:
@@ -273,16 +296,16 @@ def _check_clock(frames: _Frames) -> list[Finding]:
     """Intervals, rate, the grippers' speed, and how late the top of the cloud follows them."""
     recording = frames.recording
     gaps = np.diff(np.asarray(recording.times, np.float64))
-    middle, uneven = np.nan, np.nan
+    middle, longest = np.nan, np.nan
     if len(gaps):
         middle = float(np.median(gaps))
-        uneven = float(np.abs(gaps / middle - 1).max())
+        longest = float(gaps.max() / middle)
     path, knots = np.asarray(recording.gripper_path), np.asarray(recording.gripper_times)
     moved = np.linalg.norm(np.diff(path, axis=0), axis=-1).max(axis=1)
     lag, rate = _lag(frames)
     why = "" if np.isfinite(lag) else "the tops of the clouds do not show it"
     return [
-        _finding("frames", uneven),
+        _finding("frames", longest),
         _finding("rate", 1 / middle),
         _finding("grippers", float((moved / np.diff(knots)).max(initial=0.0))),
         _finding("clock", lag, why),
@@ -354,12 +377,19 @@ def _residual(recording: Recording, at: np.ndarray, tops: np.ndarray, axes: list
 # The clouds: are there enough points, on the sheet alone, and was none of it cut off?
 
 
+def _check_strays(recording: Recording) -> list[Finding]:
+    """Shares of all points that are no measurement of the sheet, where there are some."""
+    odd = strays(recording)
+    shares = {kind: share(recording, kind, odd) for kind in odd}
+    return [_finding(kind, part, f"{words}:") for kind, (part, words) in shares.items() if part]
+
+
 def _check_clouds(frames: _Frames) -> list[Finding]:
     """Number of points, outliers, faces of a box that cut the clouds, distance of the grippers."""
     info = frames.recording.info
     used = slice(info.frames_used[0], info.frames_used[1] + 1)
     clouds = frames.thinned[used]
-    farthest = BEYOND * np.array([_reach(info.sheet, name) for name in info.sheet.pinned])
+    farthest = BEYOND * np.array([reach(info.sheet, name) for name in info.sheet.pinned])
     stray, near = [], []
     for points, grippers in zip(clouds, frames.grippers[used], strict=True):
         away = np.linalg.norm(points[:, None] - grippers, axis=-1)
@@ -371,13 +401,30 @@ def _check_clouds(frames: _Frames) -> list[Finding]:
         _finding("outliers", float(np.median(stray))),
         _finding("grip", float(np.median(near))),
     ]
+    edges = np.array([corner(info.sheet, name) for name in CORNERS])
+    edges = np.concatenate([edges, frames.grippers[used].reshape(-1, 3)])
     for axis, letter in enumerate("xyz"):
         for side, name in ((-1, "below"), (1, "above")):
             share, place = _cut(clouds, axis, side)
             if axis == 2 and side < 0 and place < info.table_height + ABOVE:
                 continue  # the table, or a cut just above it
+            if np.abs(edges[:, axis] - place).min() < EDGE:
+                share = 0.0  # it is the sheet's own border, at rest or where it is held
             words = f"share of frames whose clouds are cut {name} {letter} = {place:.3f} m"
             findings.append(_finding("crop", share, words, f"crop {letter}"))
+    return findings
+
+
+def _check_cameras(recording: Recording) -> list[Finding]:
+    """What each camera alone showed when the recording was converted, as far as it did."""
+    findings = []
+    for fit in recording.info.camera_fits:
+        for kind in ("depth", "apart", "shift", "turn"):
+            key = f"camera {kind}"
+            if (figure := getattr(fit, kind)) is not None:
+                findings.append(_finding(key, figure, name=f"{key} {fit.name}"))
+                if kind == "depth" and findings[-1].is_suspicious:
+                    break  # the others follow from it
     return findings
 
 

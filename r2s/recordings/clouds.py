@@ -1,8 +1,9 @@
 """Point clouds: files, frames in folders, thinning and cleaning."""
 
+import io
 import re
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,12 +73,34 @@ def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
     """The points of a file, in the file's units, as float64, in the order of the file.
 
     The suffix says the format: npy; ply (vertices; needs trimesh); obj (vertices); xyz (three
-    columns parted by blanks or commas, # starts a comment); pcd (needs pypcd4).
+    columns, or six with normals or colours, parted by blanks or commas, # starts a comment); pcd
+    (needs pypcd4); e57 (all scans; needs pye57). Points of which no number is finite are left out:
+    so PCL and Open3D write where a camera measured nothing (`read_frames` counts them).
 
     Raises FileNotFoundError, ImportError (names the extra to install), or a ValueError that names
     the file and what is wrong with it.
     """
-    values = read_values(path)
+    return _returns(path, read_values(path))
+
+
+def read_frames(files: Iterable[Path]) -> list[Float[np.ndarray, "point 3"]]:
+    """The clouds of files, as `read_cloud`; warns, once, of points without a measurement."""
+    clouds, lost, folder = [], 0, None
+    for file in files:
+        values, folder = read_values(file), file.parent
+        clouds.append(_returns(file, values))
+        lost += len(values) - len(clouds[-1])
+    if lost:
+        share = lost / (lost + sum(map(len, clouds)))
+        warnings.warn(
+            f"{folder}: {share:.1%} of the points are NaN, not measured: left out", stacklevel=2
+        )
+    return clouds
+
+
+def _returns(path: Path | str, values: np.ndarray) -> Float[np.ndarray, "point 3"]:
+    if values.ndim == 2:
+        values = values[np.isfinite(values).any(axis=1)]
     try:
         return numbers("the cloud", values, "point", 3)
     except ValueError as error:
@@ -136,14 +159,19 @@ def _read_npy(path: Path) -> np.ndarray:
 
 def _read_ply(path: Path) -> np.ndarray:
     trimesh = require("trimesh", "study", f"{path}: clouds in ply files")
-    header = path.read_bytes().partition(b"end_header")[0]
+    header, end, body = path.read_bytes().partition(b"end_header")
     promised = re.search(rb"^element vertex (\d+)", header, re.MULTILINE)
     if not header.startswith(b"ply") or promised is None:
         raise ValueError("no ply header that names vertices")
     if int(promised[1]) == 0:
         return np.zeros(0)
-    # process=False: else vertices are merged and reordered.
-    vertices = np.asarray(getattr(trimesh.load(path, process=False), "vertices", ()))
+    # trimesh stumbles over lists of nothing
+    header = re.sub(rb"element (?!vertex)\S+ 0\s*\n(property .*\n)*", b"", header)
+    # process, fix_texture: else vertices are merged and reordered, and doubled at seams of textures
+    mesh: Any = trimesh.load(
+        io.BytesIO(header + end + body), file_type="ply", process=False, fix_texture=False
+    )
+    vertices = np.asarray(getattr(mesh, "vertices", ()))
     if len(vertices) != int(promised[1]):
         raise ValueError(f"the header promises {int(promised[1])} vertices, found {len(vertices)}")
     return vertices
@@ -151,23 +179,37 @@ def _read_ply(path: Path) -> np.ndarray:
 
 def _read_obj(path: Path) -> np.ndarray:
     # By hand: trimesh drops the vertices that no face uses and repeats others.
-    lines = (line.split() for line in path.read_text().splitlines())
+    lines = (line.split() for line in path.read_text(errors="replace").splitlines())
     return np.array([line[1:4] for line in lines if line[:1] == ["v"]], np.float64)
 
 
 def _read_xyz(path: Path) -> np.ndarray:
     with warnings.catch_warnings(action="ignore"):  # an empty file is an error of its own
-        return np.loadtxt(path.read_text().replace(",", " ").splitlines(), ndmin=2)
+        values = np.loadtxt(path.read_text().replace(",", " ").splitlines(), ndmin=2)
+    return values[:, :3] if values.shape[1] == 6 else values  # normals or colours follow
 
 
 def _read_pcd(path: Path) -> np.ndarray:
     if not path.is_file():  # before pypcd4, which wraps this error
         raise FileNotFoundError(f"{path}: no such file")
-    cloud = require("pypcd4", "pcd", f"{path}: clouds in pcd files").PointCloud.from_path(path)
+    reader = require("pypcd4", "pcd", f"{path}: clouds in pcd files").PointCloud
+    data = path.read_bytes()
+    if re.search(rb"^DATA\s+ascii", data, re.MULTILINE):  # pypcd4 stumbles over blanks at line ends
+        data = b"\n".join(b" ".join(line.split()) for line in data.splitlines() if line.strip())
+    cloud = reader.from_fileobj(io.BytesIO(data))
     values = cloud.numpy(("x", "y", "z"))
     if len(values) != cloud.points:
         raise ValueError(f"the header promises {cloud.points} points, found {len(values)}")
     return values
+
+
+def _read_e57(path: Path) -> np.ndarray:
+    """All scans of a file, in its world, but for points that are marked invalid."""
+    path.open("rb").close()  # so that a missing file is named
+    with require("pye57", "e57", f"{path}: clouds in e57 files").E57(str(path)) as file:
+        scans = [file.read_scan(i, ignore_missing_fields=True) for i in range(file.scan_count)]
+    axes = [[scan[f"cartesian{axis}"] for axis in "XYZ"] for scan in scans]
+    return np.concatenate([np.stack(each, axis=1) for each in axes])
 
 
 READERS: dict[str, Callable[[Path], np.ndarray]] = {
@@ -176,6 +218,7 @@ READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".obj": _read_obj,
     ".xyz": _read_xyz,
     ".pcd": _read_pcd,
+    ".e57": _read_e57,
 }
 
 

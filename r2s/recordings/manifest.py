@@ -13,9 +13,10 @@ from jaxtyping import Float
 
 from r2s._util.files import read_json
 from r2s._util.units import not_negative, positive
+from r2s.recordings.camera_fits import fit_cameras
 from r2s.recordings.cameras import is_rotation
 from r2s.recordings.clocks import EPOCH, find_frames, times_of
-from r2s.recordings.clouds import READERS, read_cloud, read_values
+from r2s.recordings.clouds import READERS, read_frames, read_values
 from r2s.recordings.gripper_paths import ORDERS, Track, merged, read_track, with_tool
 from r2s.recordings.recording import (
     MeasurementUncertainty,
@@ -26,6 +27,7 @@ from r2s.recordings.recording import (
 )
 from r2s.recordings.rgbd import find_rig, frame_times, read_clouds, read_rig
 from r2s.recordings.segmentation import FrameCuts, Segmentation, Segmenter, read_colours
+from r2s.recordings.strays import at_one_place, check_unit
 from r2s.recordings.views import Views, shifted
 
 Vector = tuple[float, float, float]
@@ -282,7 +284,12 @@ def read_recording(
             box = session.workspace or views.clean.workspace
             views = replace(views, clean=replace(views.clean, workspace=box))
             views = shifted(views, shift)
+
+    def in_world(points: np.ndarray) -> np.ndarray:
+        return to_world(scenario.cloud, points) + np.array(shift)
+
     cuts, rate = [] if cuts is None else cuts, scenario.frame_rate
+    alone: list[dict[str, np.ndarray]] = []  # by camera
     if (rig := read_rig(folder / name) if find_rig(folder / name) else None) is not None:
         times = frame_times(folder / name, rig, rate)
         frames, used = None, _used(folder / name, scenario.frames_used, range(len(times)))
@@ -292,13 +299,13 @@ def read_recording(
         used = _used(folder / name, scenario.frames_used, frames.numbers)
     knots, start = _clocks(name, track, times, scenario)
     clock = knots - scenario.time_offset  # that of the frames
-    segmenter = _segmenter(folder / name, scenario, shift, held, clock, used, cuts)
+    segmenter = _segmenter(folder / name, scenario, in_world, held, clock, used, cuts)
     if frames is None:
         assert rig is not None
-        times, clouds = read_clouds(folder / name, rig, rate, watch, segmenter)
+        times, clouds = read_clouds(folder / name, rig, rate, watch, segmenter, alone)
         verified = None
     else:
-        clouds = [read_cloud(frame) for frame in watch(frames.files)]
+        clouds = read_frames(watch(frames.files))
         values = {f"{name}/{f.name}": c for f, c in zip(frames.files, clouds, strict=True)}
         values |= {f.name: read_values(f) for f in paths if f.suffix == ".npy"}
         verified = _verify(manifest.files, name, values)
@@ -322,10 +329,12 @@ def read_recording(
         time_offset=scenario.time_offset,
         doubt=scenario.doubt,
         views=views,
+        camera_fits=fit_cameras(rig.cameras, alone, scenario.sheet, in_world) if rig else (),
     )
+    clouds = [in_world(points) for points in clouds]
+    check_unit(folder / name, clouds[0], scenario.sheet.size)
     return make_recording(
-        [to_world(scenario.cloud, points) + np.array(shift) for points in clouds],
-        times - start + scenario.time_offset,
+        *(clouds, times - start + scenario.time_offset),
         *(held, knots - start, info),
     )
 
@@ -398,15 +407,14 @@ def _used(folder: Path, used: tuple[int, ...], numbers: Sequence[int]) -> tuple[
 
 
 def _segmenter(
-    folder: Path, scenario: Scenario, shift: Vector, path: Any, clock: Any, used: Any, cuts: Any
+    folder: Path, scenario: Scenario, in_world: Any, path: Any, clock: Any, used: Any, cuts: Any
 ) -> Segmenter | None:
     """What cuts the cloth of a recording out of its frames; None: all points are of the cloth."""
     if (how := _segmentation(folder, scenario)) is None:
         return None
     return Segmenter(
         *(how, scenario.sheet, scenario.table_height, path, clock, str(folder)),
-        lambda points: to_world(scenario.cloud, points) + np.array(shift),
-        *(used, cuts),
+        *(in_world, used, cuts),
     )
 
 
@@ -449,5 +457,7 @@ def _verify(listed: Mapping[str, str], name: str, values: Mapping[str, np.ndarra
 
 
 def _distinct(points: np.ndarray) -> np.ndarray:
-    _, first = np.unique(points, axis=0, return_index=True)
-    return points[np.sort(first)]
+    """One of points that are equal; all where they are too many, which `check` counts."""
+    kept = at_one_place(points)
+    kept[np.unique(points, axis=0, return_index=True)[1]] = True
+    return points[kept]

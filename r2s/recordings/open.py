@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import re
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +15,7 @@ from jaxtyping import Float, Integer
 
 from r2s._util.extras import require
 from r2s._util.files import read_npz, write_npz, write_text
+from r2s.recordings.checks import at_conversion
 from r2s.recordings.datasets import known_bar
 from r2s.recordings.manifest import (
     Manifest,
@@ -25,6 +27,7 @@ from r2s.recordings.manifest import (
 )
 from r2s.recordings.recording import FORMAT, Recording, load, save
 from r2s.recordings.segmentation import FrameCuts, shares
+from r2s.recordings.strays import without_strays
 from r2s.recordings.swings import is_swing, read_swing
 
 Draw = Callable[[Path, str, list[FrameCuts]], None]  # a file, a title, what to draw
@@ -62,12 +65,19 @@ def open_recording(path: Path | str) -> Recording:
 
 
 def open_recordings(paths: Sequence[Path]) -> Iterator[Recording]:
-    """Read recordings of NPZ files, folders of them, or folders of frames (`open_recording`)."""
+    """Read recordings of NPZ files, folders of them, or folders of frames (`open_recording`).
+
+    Points that are no measurement of the sheet are left out, with a warning (`without_strays`).
+    """
     for path in paths:
         files = sorted(path.glob("*.npz"))
         if not files or (path / "manifest.json").exists():
             files = [path]
-        yield from map(open_recording, files)
+        for recording in map(open_recording, files):
+            recording, said = without_strays(recording)
+            if said:
+                warnings.warn(f"{recording.info.name}: {said}", stacklevel=2)
+            yield recording
 
 
 def save_trajectory(path: Path | str, x: Any, faces: Any) -> None:
@@ -177,5 +187,7 @@ def _convert_one(
             draw(to / f"{name}_cuts.png", name, cuts)
     save(recording, file)
     write_text(mark, made_from + "\n")
-    done = f"{len(recording.times)} frames, {int(recording.mask.sum())} points, {file}"
-    return done + (f"; cuts: {shares(np.sum([c.counts for c in cuts], axis=0))}" if cuts else "")
+    said = [f"{len(recording.times)} frames, {int(recording.mask.sum())} points, {file}"]
+    said += [f"cuts: {shares(np.sum([c.counts for c in cuts], axis=0))}"] if cuts else []
+    said += [finding.describe() for finding in at_conversion(recording) if finding.is_suspicious]
+    return "; ".join(said)

@@ -14,11 +14,12 @@ from jaxtyping import Array, Bool, Float
 from r2s._util.files import parse, read_npz, write_npz
 from r2s._util.units import positive
 from r2s.recordings.clouds import draw_points, numbers, voxel_means
-from r2s.recordings.views import Views
+from r2s.recordings.views import CameraFit, Views
 
-FORMAT = "r2s-recording/3"
-# the first knew neither force nor markers nor wind, the second neither doubt nor views
-READABLE = ("r2s-recording/1", "r2s-recording/2", FORMAT)
+FORMAT = "r2s-recording/4"
+# the first knew neither force nor markers nor wind, the second neither doubt nor views, the third
+# no fits of cameras
+READABLE = ("r2s-recording/1", "r2s-recording/2", "r2s-recording/3", FORMAT)
 CORNERS = {"origin": (0, 0), "warp": (1, 0), "weft": (0, 1), "opposite": (1, 1)}
 OPTIONAL = ("force", "force_times", "markers", "markers_seen", "marker_places")
 PATH = ("knot", "gripper", 3)
@@ -93,6 +94,7 @@ class RecordingInfo:
     - `time_offset`: added to the cameras' clock to give `Recording.times`; negative where the
       cameras lag behind the grippers. `set_time_offset` changes it.
     - `doubt`: standard deviations of all this; `views`: the cameras; None: unknown.
+    - `camera_fits`: what each depth camera shows alone, of RGB-D images; found at conversion.
     - `angle`: from the pull of a stretching to the warp: 45 on the bias, 90 along the weft.
     """
 
@@ -110,6 +112,7 @@ class RecordingInfo:
     doubt: MeasurementUncertainty | None = None
     views: Views | None = None
     angle: float = 0.0  # [degrees]
+    camera_fits: tuple[CameraFit, ...] = ()
 
     def __post_init__(self) -> None:
         if self.wind is not None and (len(self.wind) != 3 or not np.isfinite(self.wind).all()):

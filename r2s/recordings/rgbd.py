@@ -16,7 +16,7 @@ import hashlib
 import itertools
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,9 +26,10 @@ from scipy.spatial import KDTree
 
 from r2s._util.files import read_json
 from r2s.recordings import images
-from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved
+from r2s.recordings.camera_fits import fit_cameras
+from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved, rays
 from r2s.recordings.clocks import Frames, find_frames, times_of
-from r2s.recordings.clouds import Cleaning, clean, inside
+from r2s.recordings.clouds import Cleaning, clean, inside, voxel_means
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
 from r2s.recordings.segmentation import Segmentation, Segmenter
 
@@ -37,6 +38,7 @@ TOGETHER = 0.005  # [s]: frames of several cameras that are nearer in time are o
 MOST = 0.5  # of the points behind a mask: at least so many are in the workspace
 DISAGREE = 0.005  # [m]: cameras whose clouds are closer than this are not swapped
 COMPARED = 2000  # points of each cloud
+THINNED = 0.005  # [m], sides of the cubes to which a camera alone is thinned
 File = Path | None
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -136,7 +138,9 @@ def rgbd_recording(
         knots = np.asarray(gripper_times, float) - info.time_offset
         what = rig.segmentation, info.sheet, info.table_height, path, knots, str(folder)
         segmenter = Segmenter(*what, frames_used=info.frames_used)
-    times, clouds = read_clouds(folder, rig, segmenter=segmenter)
+    alone: list[dict[str, np.ndarray]] = []
+    times, clouds = read_clouds(folder, rig, segmenter=segmenter, alone=alone)
+    info = replace(info, camera_fits=fit_cameras(rig.cameras, alone, info.sheet))
     clock = times + info.time_offset
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
 
@@ -147,17 +151,23 @@ def read_clouds(
     frame_rate: float = 0.0,
     watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
     segmenter: Segmenter | None = None,
+    alone: list[dict[str, Float[np.ndarray, "_ 3"]]] | None = None,
 ) -> tuple[Float[np.ndarray, " frame"], list[Float[np.ndarray, "point 3"]]]:
     """Times [s] on the cameras' clock, and the cleaned clouds [m]; raises as `stream`.
 
-    Frames come through `watch`, such as a bar that shows progress.
+    Frames come through `watch`, such as a bar that shows progress. What each camera sees alone,
+    thinned, is appended to `alone`, frame by frame.
     """
-    frames = list(watch(stream(folder, rig, frame_rate, segmenter)))
+    frames = list(watch(stream(folder, rig, frame_rate, segmenter, alone)))
     return np.array([time for time, _ in frames]), [cloud for _, cloud in frames]
 
 
 def stream(
-    folder: Path | str, rig: Rig, frame_rate: float = 0.0, segmenter: Segmenter | None = None
+    folder: Path | str,
+    rig: Rig,
+    frame_rate: float = 0.0,
+    segmenter: Segmenter | None = None,
+    alone: list[Any] | None = None,
 ) -> Iterator[tuple[float, Float[np.ndarray, "point 3"]]]:
     """Time [s] and cleaned cloud [m] of one frame after the other: the images of one are in memory.
 
@@ -178,14 +188,19 @@ def stream(
     depths = {name: frames for name, (frames, _, _) in files.items()}
     last: dict[str, bytes] = {}
     is_compared = False
+    for name, camera in rig.cameras.items():
+        _check_lens(name, camera)
     for frame, (time, chosen) in enumerate(_paired(folder, rig, depths, frame_rate)):
         parts = {}
         for name, i in chosen.items():
             frames, masks, colours = files[name]
             parts[name] = _camera_cloud(rig, name, frames.files[i], masks[i], colours[i], last)
+        by_camera = {name: part.points for name, part in parts.items()}
         if not is_compared and len(parts) > 1:
             is_compared = True
-            _check_swapped(folder, rig, {name: part.points for name, part in parts.items()})
+            _check_swapped(folder, rig, by_camera)
+        if alone is not None:
+            alone.append({name: voxel_means(part, THINNED) for name, part in by_camera.items()})
         points = _cloth(list(parts.values()), time, segmenter)
         cloud = clean(points, rig.clean, frame)
         if len(cloud) == 0:
@@ -211,6 +226,16 @@ def _paired(folder: Path, rig: Rig, depths: Mapping[str, Frames], frame_rate: fl
         return pair(times, rig.pair_tolerance)
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from error
+
+
+def _check_lens(name: str, camera: DepthCamera) -> None:
+    """Say which share of the pixels has no ray; refuse a camera where that is most of them."""
+    lost = float(np.isnan(rays(camera)[..., 0]).mean())
+    words = f"{NAME}: {name}: its lens and distortion give {lost:.1%} of the pixels no direction"
+    if lost > MOST:
+        raise ValueError(f'{words}: correct them ("lens": "fisheye" for numbers of cv2.fisheye)')
+    if lost:
+        warnings.warn(f"{words}: left out", stacklevel=3)
 
 
 class _Seen(NamedTuple):
@@ -283,7 +308,9 @@ def _camera_cloud(
     camera = rig.cameras[name]
     depth = images.read_depth(depth_file, camera.depth_scale, camera.resolution)
     _warn_of_repeats(name, depth_file, depth, last)
-    where = depth > 0
+    if camera.depth_along == "ray":
+        depth = depth / np.sqrt(1 + (rays(camera) ** 2).sum(axis=-1))
+    where = (depth > 0) & np.isfinite(rays(camera)[..., 0])
     if mask_file is not None:
         where &= _mask(name, camera, depth_file, mask_file, where)
     if rig.clean.edge > 0:

@@ -63,9 +63,11 @@ def _boxes(
     plane = corners[..., :2] / np.maximum(z, NEAREST)[..., None]
     boxes = []
     for axis, lines in ((0, directions[..., 0].T), (1, directions[..., 1])):
-        # what a column (row) of pixels sees lies between these, made to grow from one to the next
-        low = np.minimum.accumulate(lines.min(axis=1)[::-1])[::-1]
-        high = np.maximum.accumulate(lines.max(axis=1))
+        # what a column (row) of pixels sees lies between these, made to grow from one to the next;
+        # pixels without a ray see nothing
+        least, most = (np.nan_to_num(lines, nan=value) for value in (np.inf, -np.inf))
+        low = np.minimum.accumulate(least.min(axis=1)[::-1])[::-1]
+        high = np.maximum.accumulate(most.max(axis=1))
         first = np.searchsorted(high, plane[..., axis].min(axis=1) - ROUNDING)
         last = np.searchsorted(low, plane[..., axis].max(axis=1) + ROUNDING, side="right") - 1
         boxes += [np.where(behind, 0, first), np.where(behind, len(lines) - 1, last)]
@@ -104,6 +106,23 @@ class Views:
                 f"a workspace from {low} to {high} m has no room between borders of "
                 f"{self.border:g} m"
             )
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """How well what one camera alone shows fits the rest; None: it shows nothing of that.
+
+    - `depth`: deviation from a plane at rest, or from the other cameras' surfaces, over the same if
+      `depth_along` was the other of axis and ray.
+    - `apart`: median distance from the other cameras' surfaces, [m].
+    - `shift`, `turn`: of the sheet that lies at rest from its place, [m] and [degrees].
+    """
+
+    name: str
+    depth: float | None = None
+    apart: float | None = None
+    shift: float | None = None
+    turn: float | None = None
 
 
 def shifted(views: Views, shift: Corner) -> Views:

@@ -125,14 +125,15 @@ def test_what_is_no_cloud_is_named(tmp_path: Path, name: str, content, words: st
         read_cloud(tmp_path / name)
 
 
-@pytest.mark.parametrize("suffix", ["npy", "ply", "obj", "xyz", "pcd"])
+@pytest.mark.parametrize("suffix", ["npy", "ply", "obj", "xyz", "pcd", "e57"])
 def test_a_missing_file_is_named(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(FileNotFoundError, match=f"nowhere.{suffix}"):
         read_cloud(tmp_path / f"nowhere.{suffix}")
 
 
 @pytest.mark.parametrize(
-    "library, suffix, extra", [("trimesh", "ply", "study"), ("pypcd4", "pcd", "pcd")]
+    "library, suffix, extra",
+    [("trimesh", "ply", "study"), ("pye57", "e57", "e57"), ("pypcd4", "pcd", "pcd")],
 )
 def test_a_missing_library_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str, suffix: str, extra: str

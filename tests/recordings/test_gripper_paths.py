@@ -39,6 +39,7 @@ def test_a_track_is_the_same_in_every_format(tmp_path, kind):
     path = tmp_path / f"path.{kind}"
     write(path, kind)
     track = read_track(path, "wxyz")
+    assert track.times is not None
     np.testing.assert_allclose(track.times, TIMES)
     np.testing.assert_allclose(track.positions[:, 0], PLACES, atol=1e-12)
     assert track.turns is not None
@@ -50,6 +51,7 @@ def test_a_tool_that_turns_carries_the_cloth_on_an_arc(tmp_path):
     path = tmp_path / "path.tum"
     write(path, "tum")
     finer, offset = with_tool(read_track(path), (0.1, 0.0, 0.0))
+    assert finer.times is not None
     held = finer.positions[:, 0] + offset[:, 0]
     np.testing.assert_allclose(held[[0, -1]], PLACES[[0, -1]] + [[0.1, 0, 0], [0, 0.1, 0]])
     np.testing.assert_allclose(np.linalg.norm(held - finer.positions[:, 0], axis=1), 0.1)
@@ -95,7 +97,5 @@ def test_a_bad_file_is_named_with_what_is_wrong(tmp_path, name, text, words):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(
-        FileNotFoundError, match="no such file, which gripper.file names"
-    ):
+    with pytest.raises(FileNotFoundError, match="no such file, which gripper.file names"):
         read_track(tmp_path / "lift.csv")

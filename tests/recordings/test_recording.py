@@ -326,7 +326,7 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "changes, words",
     [
-        ({"meta": np.array('{"format": "r2s-recording/4"}')}, "r2s-recording/4.*expected.*update"),
+        ({"meta": np.array('{"format": "r2s-recording/9"}')}, "r2s-recording/9.*expected.*update"),
         ({"meta": np.array('{"format": "r2s-recording/2"}')}, "it lacks 'info'"),
         ({"offsets": np.array([0, 3, 6])}, "offsets must go from 0 to 7"),
         ({"points": None}, "points"),
