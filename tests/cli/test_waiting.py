@@ -20,7 +20,7 @@ def test_the_line_moves_while_the_main_thread_waits() -> None:
         line(3, 4e-6)
     told = terminal.getvalue()
     assert before >= 5 and "simulating 60 frames" in told
-    assert "iteration 3, root of loss 0.002" in told and told.endswith("\r\x1b[K")
+    assert "iteration 3, root of loss 2 mm" in told and told.endswith("\r\x1b[K")
 
 
 def test_a_file_gets_a_line_now_and_then() -> None:
