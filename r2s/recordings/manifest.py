@@ -187,6 +187,8 @@ def manifest_of(folder: Path | str) -> Path:
     """The file of a folder of recordings: its own `manifest.json`, or the default one where the
     grippers' paths are those of DIFFCLOUD. Raises ValueError for another folder without."""
     folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder of recordings")
     if (own := folder / "manifest.json").exists():
         return own
     published = read_manifest(default_manifest())

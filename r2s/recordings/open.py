@@ -143,8 +143,6 @@ def _names(folder: Path, only: str) -> tuple[Path, list[str]]:
         wanted = re.compile(only)
     except re.error as error:
         raise ValueError(f"only: {only!r} is no regular expression: {error}") from error
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder of recordings")
     one = folder.resolve()
     with contextlib.suppress(ValueError):  # no manifest
         if one.name in read_recordings(one.parent, manifest_for(one.parent)):

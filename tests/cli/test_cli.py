@@ -77,7 +77,7 @@ def test_the_data_sets_are_listed(capsys: pytest.CaptureFixture) -> None:
     [
         ("data fetch blanco_mulero --to HERE", "10.5281/zenodo.13823986"),
         ("data fetch none --to HERE", "no data set 'none'; there are"),
-        ("data convert HERE --to HERE/out", "no recording whose"),
+        ("data convert HERE --to HERE/out", "no manifest.json"),
         ("show HERE/no.npz --out HERE", "no.npz: no such recording"),
         ("simulate lifting --fabric felt --out HERE/out", "felt: no such card, and no preset"),
         (

@@ -388,7 +388,7 @@ def test_a_changed_colour_image_is_converted_again_where_it_is_read(
     picture.write_bytes(encode_png(np.zeros((90, 120, 3), np.uint8)))
     assert "up to date" not in next(convert(folder, tmp_path / "out"))
     picture.unlink()
-    with pytest.raises(ValueError, match="colour: frame 0 is missing"):
+    with pytest.raises(ValueError, match="colour: no image that belongs to .*000.png"):
         next(convert(folder, tmp_path / "out"))
     shutil.rmtree(picture.parent)
     with pytest.raises(ValueError, match="c0/colour: no such folder"):

@@ -176,7 +176,7 @@ def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
     ("arguments", "message"),
     [
         (("--data", "no-such-folder"), "no such folder"),
-        (("--data", "r2s"), "no recording"),
+        (("--data", "r2s"), "no manifest.json"),
         (("--data", "r2s", "--density", "-1"), "must be positive"),
         (("--fabrics", "silk"), "no preset 'silk'"),
         (("--configurations", "diffcp-felt"), "no configuration 'diffcp-felt'; there"),
