@@ -52,12 +52,12 @@ def pair(
     their mean time; others stand alone. 0: `TOGETHER`, or a quarter of the shortest interval of a
     camera if that is less.
     """
-    if max(t[0] for t in times.values()) > min(t[-1] for t in times.values()):
-        spans = ", ".join(f"{name} {t[0]:g} to {t[-1]:g} s" for name, t in times.items())
-        raise ValueError(f"the cameras never ran at once: {spans}: check that they share a clock")
     if tolerance == 0:
         gaps = np.concatenate([np.diff(t) for t in times.values()])
         tolerance = min(TOGETHER, float(gaps.min(initial=1.0)) / 4)
+    if max(t[0] for t in times.values()) > min(t[-1] for t in times.values()) + tolerance:
+        spans = ", ".join(f"{name} {t[0]:g} to {t[-1]:g} s" for name, t in times.items())
+        raise ValueError(f"the cameras never ran at once: {spans}: check that they share a clock")
     events = sorted((t, name, i) for name, clock in times.items() for i, t in enumerate(clock))
     groups: list[list[tuple[float, str, int]]] = []
     for event in events:
