@@ -92,7 +92,10 @@ def read_npz(path: Path | str, *needed: str) -> dict[str, np.ndarray]:
     one of the arrays `needed` is missing.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        stored = np.load(path, allow_pickle=False)
+        if isinstance(stored, np.ndarray):
+            raise TypeError("it is one array (NPY), no archive of several (NPZ)")
+        with stored as file:
             arrays = dict(file)
     except FileNotFoundError:
         raise
@@ -170,10 +173,11 @@ def _read_fields(kind: Any, value: Any, where: str) -> Any:
         if "unknown" in field.metadata and value.get(name) is None:
             raise ValueError(f"{where}: {name} is unknown: {field.metadata['unknown']}")
     needed = {name for name, field in fields.items() if field.default is dataclasses.MISSING}
-    if missing := sorted(needed - value.keys()):
-        raise ValueError(f"{where}: missing: {', '.join(missing)}")
-    if unknown := sorted(value.keys() - fields.keys()):
-        raise ValueError(f"{where}: unknown: {', '.join(unknown)}; known: {', '.join(fields)}")
+    missing, unknown = sorted(needed - value.keys()), sorted(value.keys() - fields.keys())
+    if missing or unknown:
+        lists = {"missing": missing, "unknown": unknown, "known": list(fields) if unknown else []}
+        said = (f"{name}: {', '.join(names)}" for name, names in lists.items() if names)
+        raise ValueError(f"{where}: {'; '.join(said)}")
     read = {name: _read(fields[name].type, v, f"{where}: {name}") for name, v in value.items()}
     try:
         return kind(**read)

@@ -140,6 +140,8 @@ def read_tests(path: Path | str) -> LaboratoryTests:
     path = Path(path)
     try:
         stored = json.loads(path.read_text(encoding="utf-8-sig"), object_hook=_with_angle)
+        if isinstance(stored, dict) and "fabric" in stored:
+            raise ValueError(f"{path}: this is a card; laboratory tests or recordings are expected")
         content = parse(_File, stored, f"{path}")
     except (json.JSONDecodeError, UnicodeDecodeError, OverflowError, RecursionError) as error:
         raise ValueError(f"{path}: no JSON: {error}") from error

@@ -134,7 +134,9 @@ class Scenario:
         not_negative("Hz", frame_rate=self.frame_rate)
         used = self.frames_used
         if used and not (len(used) == 2 and 0 <= used[0] <= used[1]):
-            raise ValueError(f"frames_used must be [first, last], found {list(used)}")
+            raise ValueError(
+                f"frames_used must be [first, last], from 0 and in this order, found {list(used)}"
+            )
         try:
             groups = re.compile(self.folder).groupindex
         except re.error as error:
