@@ -3,6 +3,7 @@
 import re
 import warnings
 from collections.abc import Collection
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,12 @@ from r2s.recordings.force_log import check_increasing, number_in, read_lines
 LONGEST = 5.0  # [s] between frames: above, times are taken for milliseconds or nanoseconds
 EPOCH = 1e6  # [s]: later times count from 1970, or from when a machine was started
 DIGITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}  # of stamps that are whole numbers, and their unit [s]
+MOST_MISSING = 0.9  # of the frames, or their numbers are something else
+DAY = re.compile(  # as in 2026-11-30_21-33-59.900, or 20261130_213359.900
+    r"(?<!\d)(\d{4})-?([01]\d)-?([0-3]\d)[T_ -]([0-2]\d)[-:_]?([0-5]\d)[-:_]?([0-5]\d)"
+    r"\.(\d{1,9})(?!\d)"
+)
+CLOCK = re.compile(r"(?<!\d)(\d{9,10})\.(\d{1,9})(?!\d)")  # anywhere, as in t1700000100.02_left
 SECONDS = re.compile(r"(?:^|[^0-9A-Za-z.])(\d+)\.(\d+)$")  # as in 1700000100.001234567
 PARTED = re.compile(r"(?:^|\D)(\d{9,10})[_-](\d{9}|\d{6})$")  # as in 1700000100_001234567
 WHOLE = re.compile(r"(?:^|\D)(\d{13}|\d{16}|\d{19})$")
@@ -91,15 +98,22 @@ def times_of(
             f"{path}: no such file, no times in the names of the frames, and no frame_rate: give "
             "one of them"
         )
-    expected = range(frames.numbers[-1] + 1)
-    if missing := sorted(set(expected) - set(frames.numbers)):
-        words = ", ".join(map(str, missing[:8])) + ", ..." * (len(missing) > 8)
+    numbers = np.array([-1, *frames.numbers])
+    count, missing = int(numbers[-1]) + 1, int(np.sum(np.diff(numbers) - 1))
+    if missing > MOST_MISSING * count:
+        raise ValueError(
+            f"{folder}: {count - missing} frames are numbered up to {count - 1} from the first: if "
+            "these are times, write them to times.csv, the time [s] of each frame on a line"
+        )
+    if missing:
+        after = numbers[:-1][np.diff(numbers) > 1][:4]
+        words = ", ".join(str(number + 1) for number in after)
         warnings.warn(
-            f"{folder}: {len(missing)} of {len(expected)} frames are missing ({words}, counted from"
-            " the first): the others are taken at their numbers over the frame rate",
+            f"{folder}: {missing} of {count} frames are missing (from {words}, counted from the"
+            " first): the others are taken at their numbers over the frame rate",
             stacklevel=2,
         )
-    return np.array(frames.numbers) / rate
+    return numbers[1:] / rate
 
 
 def read_times(path: Path) -> Float[np.ndarray, " frame"]:
@@ -130,7 +144,9 @@ def _stamps(folder: Path, files: list[Path]) -> Float[np.ndarray, " frame"] | No
         return np.array([int(m[1]) * DIGITS[len(m[1])] for m in whole if m])
     if all(parted := [PARTED.search(stem) for stem in stems]):
         return np.array([int(m[1]) + float(f"0.{m[2]}") for m in parted if m])
-    if not all(pairs := [SECONDS.search(stem) for stem in stems]):
+    if all(days := [DAY.search(stem) for stem in stems]):
+        return np.array([_seconds(m) for m in days if m])
+    if not all(pairs := [CLOCK.search(stem) or SECONDS.search(stem) for stem in stems]):
         return None
     seconds, fractions = zip(*((m[1], m[2]) for m in pairs if m), strict=True)
     widths = {len(fraction) for fraction in fractions}
@@ -144,3 +160,10 @@ def _stamps(folder: Path, files: list[Path]) -> Float[np.ndarray, " frame"] | No
     if len(set(seconds)) == 1 and min(widths) >= 4 and np.all(np.diff(np.sort(last)) == 1):
         return None  # a version, and the number of a frame
     return np.array([float(f"{a}.{b}") for a, b in zip(seconds, fractions, strict=True)])
+
+
+def _seconds(match: re.Match[str]) -> float:
+    """The time [s] of a date and time of day in a name."""
+    *parts, fraction = match.groups()
+    day = datetime(*map(int, parts), tzinfo=UTC)  # no month 13 and no minute 61
+    return day.timestamp() + float(f"0.{fraction}")

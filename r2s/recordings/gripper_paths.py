@@ -23,6 +23,8 @@ LENGTHS = {"": 1.0, **METRES}  # units of positions; "": those of the file's tra
 UNITLESS = {"": 1.0, "-": 1.0}
 TEXT = (".csv", ".txt", ".tum")
 FORMATS = (".npy", ".csv", ".txt", ".tum", ".npz", ".json")
+SAME = 1e-5  # [s]: knots of several grippers that are nearer in time are one
+SLOWEST = 5.0  # [s] between knots of a track: above, its times are in milliseconds or less
 TURN = np.radians(2)  # between knots: above, knots are put in between
 ORDERS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}  # where x, y, z, w are
 
@@ -70,6 +72,10 @@ def read_track(path: Path, order: str = "") -> Track:
         words = str(error)
         raise ValueError(words if words.startswith(str(path)) else f"{path}: {words}") from error
     check_increasing(path, list(range(1, len(times) + 1)), times)
+    apart = float(np.median(np.diff(times))) if len(times) > 2 else 0.0
+    if apart > SLOWEST:
+        words = "give times in seconds, not in milliseconds or nanoseconds"
+        raise ValueError(f"{path}: knots are {apart:g} s apart: {words}")
     return Track(times, positions, None if quaternions is None else _turns(path, quaternions))
 
 
@@ -108,7 +114,8 @@ def merged(tracks: list[Track]) -> Track:
         if len(lengths) > 1:
             raise ValueError(f"the grippers' files have {sorted(lengths)} knots, and no times")
         return Track(None, np.concatenate([track.positions for track in tracks], axis=1))
-    times = np.unique(np.concatenate(timed))
+    times = np.sort(np.concatenate(timed))
+    times = times[np.append(True, np.diff(times) > SAME)]
     columns = [
         np.stack([np.interp(times, own, axis) for axis in track.positions[:, i].T], axis=1)
         for own, track in zip(timed, tracks, strict=True)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from r2s._util.files import read_json
 from r2s._util.units import not_negative, positive
-from r2s.recordings.camera_fits import fit_cameras
+from r2s.recordings.camera_fits import fit_cameras, is_at_rest
 from r2s.recordings.cameras import is_rotation
 from r2s.recordings.clocks import EPOCH, find_frames, times_of
 from r2s.recordings.clouds import READERS, read_frames, read_values
@@ -279,15 +279,7 @@ def read_recording(
     scenario_name, scenario, match = _scenario_of(manifest, name)
     paths = _gripper_files(folder, scenario, name, match)
     track, held = _held(paths, scenario.gripper)
-    shift, views = (0.0, 0.0, 0.0), scenario.views
-    if scenario.sessions:
-        patterns = [session.recordings for session in scenario.sessions]
-        session = scenario.sessions[_matching(name, patterns, "sessions")[0]]
-        shift = session.shift
-        if views is not None:
-            box = session.workspace or views.clean.workspace
-            views = replace(views, clean=replace(views.clean, workspace=box))
-            views = shifted(views, shift)
+    shift, views = _in_session(scenario, name)
 
     def in_world(points: np.ndarray) -> np.ndarray:
         return to_world(scenario.cloud, points) + np.array(shift)
@@ -310,15 +302,17 @@ def read_recording(
         verified = None
     else:
         clouds = read_frames(watch(frames.files))
-        values = {f"{name}/{f.name}": c for f, c in zip(frames.files, clouds, strict=True)}
-        values |= {f.name: read_values(f) for f in paths if f.suffix == ".npy"}
-        verified = _verify(manifest.files, name, values)
+        verified = _verified(manifest, name, frames.files, clouds, paths)
         if segmenter is not None:
             clouds = _cut_out(segmenter, frames.files, times, clouds)
         if scenario.drop_repeats:
             clouds = [_distinct(points) for points in clouds]
     if views is not None and segmenter is not None and cuts:  # what is cut off is not seen
         views = replace(views, hidden=max(views.hidden, segmenter.how.gripper_radius))
+    fits = ()
+    if rig is not None:
+        at_rest = is_at_rest(float(times[0]), clock, held)
+        fits = fit_cameras(rig.cameras, alone, scenario.sheet, in_world, at_rest)
     source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
     info = RecordingInfo(
         name=name,
@@ -333,14 +327,12 @@ def read_recording(
         time_offset=scenario.time_offset,
         doubt=scenario.doubt,
         views=views,
-        camera_fits=fit_cameras(rig.cameras, alone, scenario.sheet, in_world) if rig else (),
+        camera_fits=fits,
     )
     clouds = [in_world(points) for points in clouds]
     check_unit(folder / name, clouds[0], scenario.sheet.size)
-    return make_recording(
-        *(clouds, times - start + scenario.time_offset),
-        *(held, knots - start, info),
-    )
+    times = times - start + scenario.time_offset
+    return make_recording(clouds, times, held, knots - start, info)
 
 
 def _clocks(name: str, track: Track, times: np.ndarray, scenario: Scenario):
@@ -446,6 +438,28 @@ def _scenario_of(manifest: Manifest, name: str) -> tuple[str, Scenario, re.Match
     known = list(manifest.scenarios.items())
     index, match = _matching(name, [scenario.folder for _, scenario in known], "scenarios")
     return *known[index], match
+
+
+def _in_session(scenario: Scenario, name: str) -> tuple[Vector, Views | None]:
+    """The shift of a recording's clouds [m], and the views with it."""
+    if not scenario.sessions:
+        return (0.0, 0.0, 0.0), scenario.views
+    patterns = [session.recordings for session in scenario.sessions]
+    session, views = scenario.sessions[_matching(name, patterns, "sessions")[0]], scenario.views
+    if views is not None:
+        box = session.workspace or views.clean.workspace
+        views = replace(views, clean=replace(views.clean, workspace=box))
+        views = shifted(views, session.shift)
+    return session.shift, views
+
+
+def _verified(
+    manifest: Manifest, name: str, files: Sequence[Path], clouds: Sequence[Any], paths: Any
+) -> bool | None:
+    """Whether clouds and the grippers' paths are those of a manifest; see `_verify`."""
+    values = {f"{name}/{f.name}": c for f, c in zip(files, clouds, strict=True)}
+    values |= {f.name: read_values(f) for f in paths if f.suffix == ".npy"}
+    return _verify(manifest.files, name, values)
 
 
 def _verify(listed: Mapping[str, str], name: str, values: Mapping[str, np.ndarray]) -> bool | None:

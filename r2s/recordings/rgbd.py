@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 
 from r2s._util.files import read_json
 from r2s.recordings import images
-from r2s.recordings.camera_fits import fit_cameras
+from r2s.recordings.camera_fits import fit_cameras, is_at_rest
 from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved, rays
 from r2s.recordings.clocks import Frames, find_frames, times_of
 from r2s.recordings.clouds import Cleaning, clean, inside, voxel_means
@@ -140,7 +140,11 @@ def rgbd_recording(
         segmenter = Segmenter(*what, frames_used=info.frames_used)
     alone: list[dict[str, np.ndarray]] = []
     times, clouds = read_clouds(folder, rig, segmenter=segmenter, alone=alone)
-    info = replace(info, camera_fits=fit_cameras(rig.cameras, alone, info.sheet))
+    path = np.asarray(gripper_path, float)
+    knots, path = np.asarray(gripper_times, float), path[:, None] if path.ndim == 2 else path
+    at_rest = is_at_rest(float(times[0]) + info.time_offset, knots, path)
+    fits = fit_cameras(rig.cameras, alone, info.sheet, at_rest=at_rest)
+    info = replace(info, camera_fits=fits)
     clock = times + info.time_offset
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
 
@@ -181,8 +185,9 @@ def stream(
     if rig.segmentation is not None and segmenter is None and not masked:
         raise ValueError(f"{folder}: a segmentation needs sheet and grippers: use rgbd_recording")
     coloured = bool(segmenter and segmenter.how.colour)
+    first = _first_number(folder, rig)
     files = {
-        name: _files(folder / name, camera, coloured and not camera.masks)
+        name: _files(folder / name, camera, coloured and not camera.masks, first)
         for name, camera in rig.cameras.items()
     }
     depths = {name: frames for name, (frames, _, _) in files.items()}
@@ -215,8 +220,17 @@ def stream(
 
 def frame_times(folder: Path | str, rig: Rig, frame_rate: float = 0.0) -> np.ndarray:
     """The times [s] of the frames of all cameras, as `stream` gives them."""
-    depths = {n: find_frames(Path(folder) / n / "depth", images.DEPTHS) for n in rig.cameras}
+    first = _first_number(Path(folder), rig)
+    depths = {n: find_frames(Path(folder) / n / "depth", images.DEPTHS, first) for n in rig.cameras}
     return np.array([time for time, _ in _paired(Path(folder), rig, depths, frame_rate)])
+
+
+def _first_number(folder: Path, rig: Rig) -> int | None:
+    """The least number of an image of any camera: all are numbered alike; None: they have times."""
+    folders = [folder / name / "depth" for name in rig.cameras]
+    frames = [find_frames(each, images.DEPTHS) for each in folders if each.is_dir()]
+    numbers = [int(each.keys[0]) for each in frames if each.stamps is None]
+    return min(numbers, default=None)
 
 
 def _paired(folder: Path, rig: Rig, depths: Mapping[str, Frames], frame_rate: float):
@@ -259,7 +273,7 @@ def _cloth(seen: list[_Seen], time: float, segmenter: Segmenter | None) -> np.nd
 
 
 def _files(
-    folder: Path, camera: DepthCamera, coloured: bool
+    folder: Path, camera: DepthCamera, coloured: bool, first: int | None
 ) -> tuple[Frames, list[File], list[File]]:
     """The depth images of a camera, the mask of each, and the colour image if it is read."""
     if not folder.is_dir():
@@ -267,7 +281,7 @@ def _files(
             f"{folder}: no folder of the camera {folder.name!r}, which {NAME} names: "
             "restore it, or take the camera out"
         )
-    depths = find_frames(folder / "depth", images.DEPTHS)
+    depths = find_frames(folder / "depth", images.DEPTHS, first)
     masks: list[File] = [None] * len(depths.files)
     if camera.masks:
         if not (folder / "masks").is_dir():

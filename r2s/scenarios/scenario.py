@@ -248,7 +248,8 @@ def _interval(times: Float[np.ndarray, " frame"]) -> tuple[float, bool]:
         return 1.0, True
     intervals = np.diff(times)
     interval = float(np.mean(intervals))
-    if np.all(np.abs(intervals - interval) <= EVEN * interval):
+    grid = times[0] + interval * np.arange(len(times))
+    if np.all(np.abs(times - grid) <= EVEN * interval):
         return round(interval, 9), True
     short = float(np.quantile(intervals, 0.1))
     if short > max(GRID, interval / 4):

@@ -185,6 +185,10 @@ def predict(
       `r2s.study.recordings.started`; none: from flat sheets.
     """
     scenarios = [from_recording(recording, SHAPES[solver]) for recording in recordings]
+    if len({scenario.interval for scenario in scenarios}) > 1:  # cameras' own clocks
+        own = list(starts) or [None] * len(recordings)
+        pairs = zip(recordings, own, strict=True)
+        return [m for r, start in pairs for m in predict([r], fabric, solver, [start])]
     if starts:
         scenarios = [started(*pair) for pair in zip(scenarios, starts, strict=True)]
     most = max(scenario.substeps for scenario in scenarios)

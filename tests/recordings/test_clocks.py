@@ -48,6 +48,9 @@ def test_bad_folders_are_refused(tmp_path):
         ["1700000100001234567", "1700000100101234567", "1700000100201234567"],
         ["lift-1700000100001", "lift-1700000100101", "lift-1700000100201"],
         ["1700000100001234", "1700000100101234", "1700000100201234"],
+        ["2026-11-30_21-33-59.900", "2026-11-30_21-34-00.000", "2026-11-30_21-34-00.100"],
+        ["left_20261130T213359.900", "left_20261130T213400.000", "left_20261130T213400.100"],
+        ["t1700000100.95_cloud", "t1700000101.05_cloud", "t1700000101.15_cloud"],
         ["0.0", "0.1", "0.2"],
         ["t_9.9", "t_10.0", "t_10.1"],  # later than their names
     ],
@@ -71,9 +74,15 @@ def test_times_without_leading_zeros_are_asked_for(tmp_path):
 
 def test_dropped_frames_leave_the_others_at_their_times_and_are_named(tmp_path):
     frames = find_frames(touch(tmp_path, "3.npy", "4.npy", "7.npy"), READERS, first=2)
-    with pytest.warns(UserWarning, match=r"3 of 6 frames are missing \(0, 3, 4, counted"):
+    with pytest.warns(UserWarning, match=r"3 of 6 frames are missing \(from 0, 3, counted"):
         times = times_of(tmp_path, frames, 10.0)
     np.testing.assert_allclose(times, [0.1, 0.2, 0.5])
+
+
+def test_numbers_that_count_something_else_are_refused(tmp_path):
+    frames = find_frames(touch(tmp_path, "0.npy", "1.npy", "123456789012345.npy"), READERS)
+    with pytest.raises(ValueError, match="3 frames are numbered up to .* write them to times.csv"):
+        times_of(tmp_path, frames, 10.0)
 
 
 def test_a_file_of_times_comes_first_and_has_a_line_for_each_frame(tmp_path):

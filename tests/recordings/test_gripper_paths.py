@@ -68,6 +68,8 @@ def test_tracks_of_two_grippers_are_joined_at_all_knots(tmp_path):
     assert both.times is not None and len(both.times) == 6 and both.positions.shape == (6, 2, 3)
     np.testing.assert_allclose(both.positions[0, 1], PLACES[0])  # rests before its own begins
     np.testing.assert_allclose(both.positions[1, 0], (PLACES[0] + PLACES[1]) / 2)
+    rounded = merged([one, one._replace(times=TIMES + 1e-6)])
+    assert rounded.times is not None and len(rounded.times) == 3
     with pytest.raises(ValueError, match="some of the grippers' files have times"):
         merged([one, one._replace(times=None)])
 
@@ -77,6 +79,7 @@ def test_tracks_of_two_grippers_are_joined_at_all_knots(tmp_path):
     [
         ("a.csv", "time_s,x,y\n0,1,2\n1,2,3\n", "expected one column 'z'"),
         ("a.csv", "time_s,x,y,z\n0,1,2,3\n0,2,3,4\n", "times must increase"),
+        ("a.tum", "0 1 2 3\n100 1 2 3\n200 1 2 3\n", "100 s apart: give times in seconds"),
         ("a.tum", "0 1 2 3 4\n", "expected 4 or 8 numbers a line"),
         ("a.tum", "0 1 2 3 0 0 0 2\n", "a quaternion of length 2, expected 1"),
         ("a.json", '{"times": [0]}', "expected an object with times and positions"),

@@ -77,6 +77,19 @@ def test_cameras_are_paired_by_time(tmp_path: Path) -> None:
         assert distances(points, surface(frame)).mean() < 2e-3
 
 
+def test_a_camera_that_lost_its_first_image_keeps_its_times(tmp_path: Path) -> None:
+    """All cameras number their frames alike, where a rate gives the times."""
+    scene = replace(write(tmp_path), frame_rate=15.0)
+    for side in ("left", "right"):
+        (tmp_path / side / "times.csv").unlink(missing_ok=True)
+    for kind in ("depth", "masks"):
+        (tmp_path / "right" / kind / "000.png").unlink()
+    with pytest.warns(UserWarning, match="1 of 4 frames are missing"):
+        _, clouds = read_clouds(tmp_path, scene)
+    for frame, points in enumerate(clouds):
+        assert distances(points, surface(frame)).mean() < 2e-3
+
+
 def test_a_mask_may_have_a_palette(folder: Path, tmp_path: Path) -> None:
     """As SAM 2 writes it: the colours mean nothing, black is the background."""
     from PIL import Image
