@@ -24,6 +24,7 @@ from r2s.recordings.recording import (
     Recording,
     check_covered,
     gripper_positions,
+    is_at_rest,
     subsample,
 )
 from r2s.recordings.views import Views
@@ -34,7 +35,6 @@ POINTS = 300  # at most, of a cloud
 TARGETS = 1200  # at most, of a cloud that the sheet must lie near
 SPACING = 0.012  # [m], of the samples of such a sheet
 ON_SHEET = 0.01  # [m], within which a marker must lie in the first frame
-STILL = 1e-3  # [m], by which grippers may have moved before a first cloud at rest
 BETWEEN = 3  # frames after the last observed one, for the interpolation in time
 CLOCK = 4.0  # standard deviations, by which a clock may be early
 # the mask of each kind of observation
@@ -208,8 +208,8 @@ class Problem(eqx.Module):
             expected = _expected(recording, scenario, frames, seed)
             thinned = subsample(recording, num_points, None, seed)
             clouds = Clouds(thinned.points[frames], thinned.mask[frames])
-            moved = np.abs(gripper_positions(recording)[0] - np.asarray(recording.gripper_path)[0])
-            begins = first == 0 and float(moved.max()) < STILL
+            knots, path = (np.asarray(a) for a in (recording.gripper_times, recording.gripper_path))
+            begins = first == 0 and is_at_rest(float(recording.times[0]), knots, path)
             if as_seen and scenario.brake is not None and begins:
                 middle = space(jnp.full(space.dim, 0.5, float))
                 scenario = start_as_seen(scenario, middle, clouds.points[0], clouds.mask[0])

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
 from r2s._util.checks import expect
 from r2s._util.extras import require
@@ -161,8 +162,6 @@ def _one_layer(
     trimesh: Any, places: np.ndarray, corners: np.ndarray, weld: float, largest: bool, changes: list
 ) -> Int[np.ndarray, "face 3 2"]:
     """The corners of one piece, without faces of no area or there twice."""
-    from scipy.spatial import cKDTree
-
     keep = trimesh.triangles.nondegenerate(places[corners[..., 0]], height=weld)
     if not np.all(keep):
         changes.append(f"{np.sum(~keep)} faces without area are left out")
@@ -183,7 +182,7 @@ def _one_layer(
         sizes = ", ".join(f"{each:.3g}" for each in np.sort(area)[::-1][:4])
         words = f"{len(area)} pieces (areas {sizes}{', ...' * (len(area) > 4)} m^2)"
         rest, others = np.unique(sheet.faces[main]), np.unique(sheet.faces[~main])
-        gap = 1e3 * np.min(cKDTree(places[rest]).query(places[others])[0])
+        gap = 1e3 * np.min(KDTree(places[rest]).query(places[others])[0])
         words += f" whose nearest vertices are {gap:.3g} mm apart"
         remedy = "join them where they were made or by --weld, or take the largest (--largest)"
         expect(largest, f"the sheet is in {words}: {remedy}")

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull, KDTree
 
 from r2s.recordings.cameras import DepthCamera, from_world, moved
-from r2s.recordings.recording import SheetPlacement, interpolated
+from r2s.recordings.recording import SheetPlacement
 from r2s.recordings.views import CameraFit
 
 Points = Float[np.ndarray, "_ 3"]
@@ -18,7 +18,6 @@ AROUND = 0.15  # [m] from its place in which a sheet at rest is looked for
 BORDER = 0.012  # [m] from the border of a sheet that is seen
 PATCH, BESIDE = 9, 0.015  # points that make a piece of a surface; [m] from it along the surface
 COMPARED = 1500  # points of each camera
-STILL = 2e-3  # [m], by which grippers may have moved before a first frame at rest
 LEAST = 2e-3  # [m], of a distance that another is divided by: noise and wrinkles
 
 
@@ -108,11 +107,3 @@ def _apart(frames: Sequence[Mapping[str, Points]], name: str) -> float:
             distances.append(across[(beside < BESIDE**2) & (gaps[:, -1] < AROUND)])
     every = np.concatenate(distances)
     return float(np.median(every)) if len(every) >= FEWEST else np.nan
-
-
-def is_at_rest(
-    time: float, knots: Float[np.ndarray, " knot"], path: Float[np.ndarray, "knot gripper 3"]
-) -> bool:
-    """Whether the grippers are still where their path [m] begins, at a time [s]."""
-    until = np.concatenate([path[knots <= time], interpolated(np.array([time]), knots, path)])
-    return bool(np.linalg.norm(until - path[0], axis=-1).max() < STILL)

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from r2s.recordings.clouds import outliers, voxel_means
 from r2s.recordings.recording import (
     CORNERS,
+    STILL,
     Recording,
     SheetPlacement,
     cloud,
@@ -85,7 +86,6 @@ VOXEL = 0.005  # [m], to which clouds are thinned
 AROUND, FEW = 0.02, 4  # [m], in which a point of a sheet has more others than that
 APART, SCRAP = 0.03, 0.05  # [m] between pieces of a cloud; share of it below which one is no sheet
 FEWEST = 50  # points of a frame that shows something
-STILL = 0.002  # [m], within which grippers are at rest
 # sheet
 CELL, MOST_SEEN = 0.02, 0.7  # [m] and share of a sheet's cells that must show its extent
 NEAR_PLANE = 0.05  # [m], of the sheet's plane at rest

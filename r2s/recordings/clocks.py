@@ -40,6 +40,12 @@ class Frames(NamedTuple):
     numbers: list[int]
     stamps: Float[np.ndarray, " frame"] | None
 
+    @property
+    def missing(self) -> list[int]:
+        """The first number of each gap."""
+        numbers = np.array([-1, *self.numbers])
+        return (numbers[:-1][np.diff(numbers) > 1] + 1).tolist()
+
 
 def find_frames(folder: Path | str, suffixes: Collection[str], first: int | None = None) -> Frames:
     """The frames of a folder, by the numbers or the times in their names (`000.npy`,
@@ -98,22 +104,21 @@ def times_of(
             f"{path}: no such file, no times in the names of the frames, and no frame_rate: give "
             "one of them"
         )
-    numbers = np.array([-1, *frames.numbers])
-    count, missing = int(numbers[-1]) + 1, int(np.sum(np.diff(numbers) - 1))
+    count = frames.numbers[-1] + 1
+    missing = count - len(frames.numbers)
     if missing > MOST_MISSING * count:
         raise ValueError(
             f"{folder}: {count - missing} frames are numbered up to {count - 1} from the first: if "
             "these are times, write them to times.csv, the time [s] of each frame on a line"
         )
     if missing:
-        after = numbers[:-1][np.diff(numbers) > 1][:4]
-        words = ", ".join(str(number + 1) for number in after)
+        words = ", ".join(map(str, frames.missing[:4]))
         warnings.warn(
             f"{folder}: {missing} of {count} frames are missing (from {words}, counted from the"
             " first): the others are taken at their numbers over the frame rate",
             stacklevel=2,
         )
-    return numbers[1:] / rate
+    return np.array(frames.numbers) / rate
 
 
 def read_times(path: Path) -> Float[np.ndarray, " frame"]:

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Num, UInt8
 
 from r2s._util.extras import require
 from r2s._util.files import write_bytes
+from r2s.recordings.clocks import find_frames
 from r2s.recordings.clouds import read_values
 
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
@@ -35,13 +36,11 @@ def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
 
 def _images(folder: Path) -> Iterator[tuple[Path, np.ndarray]]:
     cv2 = require("cv2", "camera", "videos and images")
-    from r2s.recordings.clocks import find_frames
-
     frames = find_frames(folder, IMAGES)
-    if missing := sorted(set(range(frames.numbers[-1] + 1)) - set(frames.numbers)):
+    if missing := frames.missing:
         raise ValueError(
-            f"{folder}: frame {missing[0]} (counted from the first) is missing, {len(missing)} in "
-            "all: restore it, or number the frames without gaps and give their times"
+            f"{folder}: frame {missing[0]} (counted from the first) is missing: restore it, or "
+            "number the frames without gaps and give their times"
         )
     for file in frames.files:
         if file.suffix.lower() == ".png":

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from r2s._util.files import read_json
 from r2s._util.units import not_negative, positive
-from r2s.recordings.camera_fits import fit_cameras, is_at_rest
+from r2s.recordings.camera_fits import fit_cameras
 from r2s.recordings.cameras import is_rotation
 from r2s.recordings.clocks import EPOCH, find_frames, times_of
 from r2s.recordings.clouds import READERS, read_frames, read_values
@@ -23,6 +23,7 @@ from r2s.recordings.recording import (
     Recording,
     RecordingInfo,
     SheetPlacement,
+    is_at_rest,
     make_recording,
 )
 from r2s.recordings.rgbd import find_rig, frame_times, read_clouds, read_rig

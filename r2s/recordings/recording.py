@@ -23,6 +23,7 @@ READABLE = ("r2s-recording/1", "r2s-recording/2", "r2s-recording/3", FORMAT)
 CORNERS = {"origin": (0, 0), "warp": (1, 0), "weft": (0, 1), "opposite": (1, 1)}
 OPTIONAL = ("force", "force_times", "markers", "markers_seen", "marker_places")
 PATH = ("knot", "gripper", 3)
+STILL = 2e-3  # [m], within which grippers are at rest
 STEP = 0.025  # [s], the longest of a simulation
 CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rate
 
@@ -254,6 +255,14 @@ def gripper_positions(recording: Recording) -> Float[np.ndarray, "frame gripper 
     """Where the grippers are at the frames [m]: linear between knots, at rest before and after."""
     arrays = recording.times, recording.gripper_times, recording.gripper_path
     return interpolated(*(np.asarray(array, np.float64) for array in arrays))
+
+
+def is_at_rest(
+    time: float, knots: Float[np.ndarray, " knot"], path: Float[np.ndarray, "knot gripper 3"]
+) -> bool:
+    """Whether the grippers are still where their path [m] begins, at a time [s]."""
+    until = np.concatenate([path[knots <= time], interpolated(np.array([time]), knots, path)])
+    return bool(np.linalg.norm(until - path[0], axis=-1).max() < STILL)
 
 
 def interpolated(

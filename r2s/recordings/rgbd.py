@@ -26,11 +26,11 @@ from scipy.spatial import KDTree
 
 from r2s._util.files import read_json
 from r2s.recordings import images
-from r2s.recordings.camera_fits import fit_cameras, is_at_rest
+from r2s.recordings.camera_fits import fit_cameras
 from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved, rays
 from r2s.recordings.clocks import Frames, find_frames, times_of
 from r2s.recordings.clouds import Cleaning, clean, inside, voxel_means
-from r2s.recordings.recording import Recording, RecordingInfo, make_recording
+from r2s.recordings.recording import Recording, RecordingInfo, is_at_rest, make_recording
 from r2s.recordings.segmentation import Segmentation, Segmenter
 
 NAME = "cameras.json"

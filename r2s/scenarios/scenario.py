@@ -4,13 +4,13 @@ import dataclasses
 import functools
 import math
 from hashlib import sha256
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from r2s._util.arrays import is_traced
 from r2s.environment.air import Fan
@@ -21,8 +21,9 @@ from r2s.mesh.mesh import Mesh, corner, rectangle
 from r2s.mesh.mesh import resized as resized_mesh
 from r2s.recordings.recording import Recording, SheetPlacement, interpolated
 from r2s.scenarios.paths import Route
+from r2s.scenarios.sheet_solver import Braked, SheetSolver
 from r2s.solvers.implicit.cloth import MAX_ITERATIONS, ImplicitCloth, prepare_mesh
-from r2s.solvers.simulate import Solution, Solver, between, simulate
+from r2s.solvers.simulate import Solution, between, simulate
 
 CLEARANCE = 1e-3  # [m], between the table and a sheet that lies on it
 LEAD_IN = 0.5  # [s], in which the grippers go from the sheet at rest to where their path begins
@@ -39,17 +40,6 @@ JET = (1 / 3, 1 / 4)  # radius and edge of a fan's jet, of the sheet's shorter s
 CLAMPS = (("origin", "weft"), ("warp", "opposite"))  # sides that a stretching holds
 BAR = (("origin", "warp"),)  # the side that a swing holds
 CLAMPED = {"stretching": CLAMPS, "swing": BAR}  # sides that are held in a scenario
-
-
-class SheetSolver(Solver, Protocol):
-    """A solver of a held sheet: ImplicitCloth, ExplicitCloth and MPMCloth."""
-
-    def init(self, x: Array, v: Array | None = None, acceleration: Array | None = None) -> Any:
-        """The state at positions [m], velocities [m/s] and accelerations [m/s^2]; None: zero."""
-
-    def step_with_forces(self, fabric: Fabric, state: Any, control: Control) -> tuple[Any, Array]:
-        """The state `dt` later, and the mean forces [N] on the pinned vertices, weight included."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -467,66 +457,3 @@ def _prepared(layout: Layout, self_contact: bool, x64: bool) -> Any:
 def begin(solver: SheetSolver, scenario: Scenario) -> Any:
     """The state of a solver from `stepped` at the start of a scenario, without velocity."""
     return solver.init(scenario.start, None, scenario.acceleration)
-
-
-class BrakedState(eqx.Module):
-    """The state of a solver (`inner`) after `count` steps."""
-
-    inner: Any
-    count: Array
-
-    @property
-    def x(self) -> Float[Array, "vertex 3"]:
-        """Positions [m]."""
-        return self.inner.x
-
-    @property
-    def v(self) -> Float[Array, "vertex 3"]:
-        """Velocities [m/s]."""
-        return self.inner.v
-
-    @property
-    def failure(self) -> Int[Array, ""]:
-        """The first `r2s.solvers.results.Result` so far."""
-        return self.inner.failure
-
-
-class Braked(eqx.Module):
-    """A solver of a sheet whose first `steps` have more mass damping, `brake` [1/s]."""
-
-    solver: SheetSolver
-    brake: Float[Array, ""]
-    steps: int = eqx.field(static=True)
-    dt: Float[Array, ""] | float
-
-    def check(self, fabric: Fabric) -> None:
-        """Raises `ValueError` where the steps are too long for a fabric."""
-        self.solver.check(fabric)
-
-    def fits(self, fabric: Fabric) -> Bool[Array, ""]:
-        """Whether the steps of the solver are short enough for a fabric, as far as is known."""
-        return self.solver.fits(fabric)
-
-    def init(
-        self, x: Array, v: Array | None = None, acceleration: Array | None = None
-    ) -> BrakedState:
-        """At positions [m], velocities [m/s] and accelerations [m/s^2]; None: zero."""
-        return BrakedState(self.solver.init(x, v, acceleration), jnp.zeros((), int))
-
-    def step(self, fabric: Fabric, state: BrakedState, control: Control) -> BrakedState:
-        """The state `dt` later."""
-        inner = self.solver.step(self._braked(fabric, state), state.inner, control)
-        return BrakedState(inner, state.count + 1)
-
-    def step_with_forces(
-        self, fabric: Fabric, state: BrakedState, control: Control
-    ) -> tuple[BrakedState, Float[Array, "pinned 3"]]:
-        """The state `dt` later, and the grippers' forces [N] on the pinned vertices."""
-        braked = self._braked(fabric, state)
-        inner, forces = self.solver.step_with_forces(braked, state.inner, control)
-        return BrakedState(inner, state.count + 1), forces
-
-    def _braked(self, fabric: Fabric, state: BrakedState) -> Fabric:
-        """The fabric with the mass damping [1/s] of this step."""
-        brake = jnp.where(state.count < self.steps, self.brake, 0)
-        return eqx.tree_at(lambda f: f.mass_damping, fabric, fabric.mass_damping + brake)

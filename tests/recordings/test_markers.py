@@ -238,4 +238,4 @@ def test_broken_images_and_videos_are_named(tmp_path: Path, pull: list[np.ndarra
     cv2.imwrite(str(file), pull[1][:80, :160])
     refused(tmp_path, "frame_001.png: frame 1 has 160 x 80 pixels, the first")
     file.unlink()
-    refused(tmp_path, r"frame 1 \(counted from the first\) is missing, 1 in all")
+    refused(tmp_path, r"frame 1 \(counted from the first\) is missing: restore it")
