@@ -127,16 +127,16 @@ class Search(NamedTuple):
         return fabric_at(self.problems[0], self.theta[theta_indices(self.problems, 0)])
 
 
-def each_alone(problems: Problems, run: Run, theta: Theta) -> list[Descent]:
+def each_alone(problems: Problems, run: Run, theta: Theta, name: str) -> list[Descent]:
     """The ends of descents in each of several recordings alone, from a theta of all of them; none
-    of a single recording."""
+    of a single recording. `name`: of their checkpoints."""
     if len(problems) < 2:
         return []
-    run, ends = run.near(is_intermediate=True)._replace(checkpoint=None), []
+    near, ends = run.near(is_intermediate=True), []
     for which, problem in enumerate(problems):
         words = f"recording {which + 1} of {len(problems)} alone"
-        own = theta[theta_indices(problems, which)]
-        ends.append(multi_start((problem,), run, start=own, words=words).best)
+        own, one = theta[theta_indices(problems, which)], near.beside(f".{name}{which + 1}.npz")
+        ends.append(multi_start((problem,), one, start=own, words=words).best)
     return ends
 
 

@@ -125,7 +125,7 @@ def with_uncertainty(
     loss = loss_from(problems, predictions)
     estimate = _collected(problems, best, search.rows, covariance, approach, loss, bias)
     try:
-        alone = each_alone(coarse, run, best.theta)
+        alone = each_alone(coarse, run, best.theta, "checked")
     except Diverged:  # on the coarser mesh, of a fabric of the finer one
         tell(run.progress, "a recording alone diverged: not compared")
         alone = []

@@ -133,7 +133,7 @@ def _first(meshes: _Meshes, shapes: Shapes, leads_on: bool) -> tuple[_Meshes, Se
     search = meshes.search(shapes, None, leads_on)
     if len(meshes.recordings) == 1:
         return meshes, search
-    alone = each_alone(search.problems, meshes.run, search.theta)
+    alone = each_alone(search.problems, meshes.run, search.theta, "alone")
     meshes = meshes._replace(weights=weights(alone))
     return meshes, meshes.search(shapes, search.theta, leads_on)
 
@@ -180,25 +180,24 @@ def look_again(search: Search, run: Run, coarse: Problems | None = None) -> Sear
 
     There is a third search where the first two differ. All losses count the same points, by the
     outlier scale of the best fit. Ends that lie apart but fit nearly as well are part of the
-    standard errors (`others`). A search that diverges counts as one that ended elsewhere. A killed
-    run repeats all of this.
+    standard errors (`others`). A search that diverges counts as one that ended elsewhere.
 
     - `coarse`: the same recordings on a coarser mesh, on which the other searches begin; None: they
       begin on the mesh of the first.
     """
     problems, ends, losses, count, close = search.problems, [search], [0.0], 1, 0
-    run = run._replace(checkpoint=None)
     one = {"num_samples": 0, "num_starts": 1, "warm_start": False, "is_intermediate": True}
     again = run._replace(budget=run.budget._replace(**one))
     while count < MOST and close < 2:
         start = _sample(problems[0].space, jr.fold_in(run.key, count))
         count += 1
         words = f"search {count}, from another start"
+        own = again.beside(f".search{count}.npz")
         try:
             if coarse is not None:
-                start = multi_start(coarse, again, start=start, words=words).theta
-            nearer = again if coarse is None else run.near(is_intermediate=True)
-            ends.append(multi_start(problems, nearer, start=start, words=words))
+                start = multi_start(coarse, own, start=start, words=words).theta
+                own = run.near(is_intermediate=True).beside(f".search{count}.end.npz")
+            ends.append(multi_start(problems, own, start=start, words=words))
         except Diverged:
             tell(run.progress, f"search {count} diverged")
         losses = _losses(ends, run)
@@ -208,7 +207,7 @@ def look_again(search: Search, run: Run, coarse: Problems | None = None) -> Sear
     others = tuple(end.theta for end in likely if end is not best)
     unsure = search.unsure if best is search else ""  # of an earlier mesh
     if best is not search:
-        to_the_end = run.near(is_intermediate=False)
+        to_the_end = run.near(is_intermediate=False).beside(".best.npz")
         best = multi_start(problems, to_the_end, start=best.theta, words="its end")
         ends.append(best)
     alone = f"none of {count - 1} searches from other starts fits as well"

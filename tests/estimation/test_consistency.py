@@ -60,7 +60,7 @@ def lifts():
 
 def ends_of(problems, place):
     theta = jnp.zeros(theta_length(problems), float).at[: len(place)].set(place)
-    return each_alone(problems, Run(DEFAULT, jax.random.key(0), remembering()), theta)
+    return each_alone(problems, Run(DEFAULT, jax.random.key(0), remembering()), theta, "alone")
 
 
 def judged(problems, place):

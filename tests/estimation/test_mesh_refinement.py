@@ -9,6 +9,7 @@ import pytest
 from known_ends import PLACE, SMALL, SPACE, end_at, lift_of, problem
 
 from r2s.estimation import mesh_refinement
+from r2s.estimation.checkpoint import forget
 from r2s.estimation.descent import DEFAULT, Diverged, Run, Search, has_arrived, is_stuck
 from r2s.estimation.estimate import as_json, from_json, point_estimate
 from r2s.estimation.gauss_newton import normal_from
@@ -206,6 +207,23 @@ def test_where_two_differ_the_best_of_three_is_taken_and_counted(monkeypatch):
     assert found.reached == (1, 3) and float(found.theta[0]) == pytest.approx(0.3)
     assert found.unsure == "none of 2 searches from other starts fits as well"
     assert found.others == ()
+
+
+def test_a_killed_look_at_other_starts_resumes(monkeypatch, tmp_path):
+    """Every search has a checkpoint of its own, which goes when the estimate is finished."""
+    files = []
+
+    def search(problems, run, *, start, words):
+        files.append(run.checkpoint)
+        run.checkpoint.touch()
+        return ended(0.3 / len(files))
+
+    monkeypatch.setattr(mesh_refinement, "multi_start", search)
+    run = by_place(monkeypatch)[0]._replace(checkpoint=tmp_path / "state.npz")
+    look_again(ended(0.6), run, coarse=(Stub(),))  # pyright: ignore
+    assert len(files) == 5 == len(set(files))  # two searches on two meshes, and the end of the best
+    forget(tmp_path / "state.npz")
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_end_that_fits_nearly_as_well_is_in_the_errors_though_it_confirms_nothing(monkeypatch):
