@@ -27,8 +27,8 @@ def start_of_block() -> tuple[np.ndarray, np.ndarray]:
 
 def block_loss(steps: int):
     """The mean square of all positions at the end, by the stiffness mu, and mu itself."""
-    grid = Grid.make((0.0, 0.0), 1 / NODES, (NODES, NODES))
-    background = Background.make(grid, gravity=GRAVITY, walls=WALLS)
+    grid = Grid((0.0, 0.0), 1 / NODES, (NODES, NODES))
+    background = Background(grid, gravity=GRAVITY, walls=WALLS)
 
     def material(mu):
         return Solid.make(NeoHookean(mu, jnp.asarray(LAMBDA, float)), MASS)

@@ -26,7 +26,8 @@ from r2s.compilation import clear
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh, rectangle
-from r2s.mesh.surface import strains, vertex_masses
+from r2s.mesh.strain_samples import on_samples
+from r2s.mesh.surface import vertex_masses
 from r2s.solvers.implicit.cloth import ImplicitCloth, ImplicitState
 from r2s.solvers.implicit.system import Pattern
 
@@ -172,6 +173,19 @@ def rotation(angle: float, axis: int):
     return jnp.eye(3).at[i, i].set(c).at[j, j].set(c).at[i, j].set(-s).at[j, i].set(s)
 
 
+def strip(axis: int, size: tuple[float, float], cells: tuple[int, int], elements="wrinkling"):
+    """A strip along warp (0) or weft (1); its size [m] and cells along it and across it."""
+    (length, width), (along, across) = size, cells
+    if axis == 0:
+        return rectangle((length, width), (along + 1, across + 1), elements)
+    return rectangle((width, length), (across + 1, along + 1), elements)
+
+
+def stretch_under(tension: float, modulus: float) -> float:
+    """The stretch s [-] at which a strip has a tension [N/m] of modulus s (s^2 - 1) / 2."""
+    return np.roots([modulus / 2, 0, -modulus / 2, -tension]).real.max()
+
+
 def two_of(mesh: Mesh) -> Mesh:
     """Two copies of a sheet that do not touch."""
     rest, faces = np.asarray(mesh.rest), np.asarray(mesh.faces)
@@ -218,11 +232,10 @@ def roll(
 @eqx.filter_jit
 def stored_energy(mesh: Mesh, fabric: Fabric, x):
     """Energy [J] in the strains and curvatures of a sheet."""
-    membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
+    membrane = on_samples(fabric.membrane.energy_density, mesh.samples.strains(x))
     bent = fabric.bending.bends(mesh).curvatures_at(x)
     bending = jax.vmap(fabric.bending.energy_density)(fabric.bending.curvatures(mesh, bent))
-    of_bending = jnp.sum(fabric.bending.areas(mesh) * bending)
-    return jnp.sum(mesh.samples.areas.ravel() * membrane) + of_bending
+    return jnp.sum(mesh.samples.areas * membrane) + jnp.sum(fabric.bending.areas(mesh) * bending)
 
 
 @eqx.filter_jit
@@ -240,6 +253,21 @@ def directional_difference(function, at, direction, size: float):
         return jax.tree.map(lambda a, d: a + sign * size * d, at, direction)
 
     return (function(moved(1)) - function(moved(-1))) / (2 * size)
+
+
+def assert_gradient(value, gradient, at, where, size: float, rel: float):
+    """A gradient agrees with central differences of a value, in one direction of a part of inputs.
+
+    `where` names the part, which is differed by a `size`.
+    """
+    part = where(at)
+    direction = jax.random.normal(jax.random.key(2), part.shape)
+    difference = directional_difference(
+        lambda part: value(eqx.tree_at(where, at, part)), part, direction, size
+    )
+    found = jnp.sum(where(gradient) * direction)
+    assert found == pytest.approx(float(difference), rel=rel)
+    assert abs(found) > 1e-12  # so the value does depend on it
 
 
 def dense(pattern: Pattern, blocks: jax.Array) -> jax.Array:

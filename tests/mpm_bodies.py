@@ -25,7 +25,7 @@ def solid(young=1e4, poisson=0.3, density=1e3, law=FixedCorotated, **others):
 def box(dimension: int, cells: int = 16, **options) -> Background:
     """A unit box with a spacing of 1 / `cells` [m], and free space around it."""
     grid = Grid.covering((0.0,) * dimension, (1.0,) * dimension, 1 / cells)
-    return Background.make(grid, **options)
+    return Background(grid, **options)
 
 
 def still(steps: int, dimension: int = 3, grippers: int = 0) -> Control:

@@ -1,11 +1,13 @@
-"""Values that XLA works out once."""
+"""Arrays: of numbers, traced or not, and those that XLA works out once."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 from jax.core import Tracer
+from jax.typing import ArrayLike
 
 
 def once(function: Callable, *arguments: Any) -> Any:
@@ -28,6 +30,11 @@ def once(function: Callable, *arguments: Any) -> Any:
         lambda: function(*arguments),
         lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
     )
+
+
+def as_floats(numbers: ArrayLike | Sequence[float]) -> Array:
+    """Numbers as an array, in JAX's default precision."""
+    return jnp.asarray(numbers, float)
 
 
 def is_traced(*trees: Any) -> bool:

@@ -11,6 +11,11 @@ def expect(holds: bool | np.bool_, problem: str) -> None:
         raise ValueError(problem)
 
 
+def expect_value(holds: bool, where: str, expected: str, found: Any) -> None:
+    """Raise `ValueError` that says what was expected where, unless the condition holds."""
+    expect(holds, f"{where}: expected {expected}, found {found!r}")
+
+
 def check_kinds(call: str, **expected: tuple[Any, type]) -> None:
     """Raise a `TypeError` that names an argument of a `call` that is of another type."""
     for name, (argument, kind) in expected.items():

@@ -18,6 +18,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from r2s._util.checks import expect_value
+
 T = TypeVar("T")
 # or a string, which may look like one
 COMMENT = re.compile(r'("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/', re.DOTALL)
@@ -126,11 +128,6 @@ def read_json(path: Path | str, kind: type[T], comments: bool = False) -> T:
     return parse(kind, value, f"{path}")
 
 
-def parse(kind: type[T], value: Any, where: str) -> T:
-    """The dataclass `kind` from what JSON gave, as `read_json`; errors begin with `where`."""
-    return _read(kind, value, where)
-
-
 def _free(folder: Path) -> str:
     try:
         return f"{shutil.disk_usage(folder).free} bytes free in {folder}"
@@ -138,8 +135,11 @@ def _free(folder: Path) -> str:
         return f"folder {folder} is missing or cannot be read"
 
 
-def _read(kind: Any, value: Any, where: str) -> Any:
-    """`value` (from JSON) as `kind`: a dataclass, tuple, mapping or plain type, or one or None."""
+def parse(kind: Any, value: Any, where: str) -> Any:
+    """What JSON gave as a dataclass, tuple, mapping or plain type, or one or None.
+
+    As `read_json`; errors begin with `where`.
+    """
     if isinstance(kind, types.UnionType):
         if value is None:
             return None
@@ -148,25 +148,25 @@ def _read(kind: Any, value: Any, where: str) -> Any:
         return _read_fields(kind, value, where)
     arguments = typing.get_args(kind)
     if typing.get_origin(kind) is tuple:
-        _expect(isinstance(value, list), "a list", value, where)
+        expect_value(isinstance(value, list), where, "a list", value)
         if arguments[1:] == (...,):
             arguments = (arguments[0],) * len(value)
-        _expect(len(value) == len(arguments), f"{len(arguments)} entries", value, where)
+        expect_value(len(value) == len(arguments), where, f"{len(arguments)} entries", value)
         entries = enumerate(zip(arguments, value, strict=True))
-        return tuple(_read(kind, entry, f"{where}[{i}]") for i, (kind, entry) in entries)
+        return tuple(parse(kind, entry, f"{where}[{i}]") for i, (kind, entry) in entries)
     if typing.get_origin(kind) is Mapping:
-        _expect(isinstance(value, dict), "an object", value, where)
-        return {key: _read(arguments[1], v, f"{where}: {key}") for key, v in value.items()}
+        expect_value(isinstance(value, dict), where, "an object", value)
+        return {key: parse(arguments[1], v, f"{where}: {key}") for key, v in value.items()}
     if kind is float:
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        _expect(number and math.isfinite(value), "a finite number", value, where)
+        expect_value(number and math.isfinite(value), where, "a finite number", value)
         return float(value)
-    _expect(type(value) is kind, f"{kind.__name__}", value, where)
+    expect_value(type(value) is kind, where, f"{kind.__name__}", value)
     return value
 
 
 def _read_fields(kind: Any, value: Any, where: str) -> Any:
-    _expect(isinstance(value, dict), "an object", value, where)
+    expect_value(isinstance(value, dict), where, "an object", value)
     value = {getattr(kind, "former", {}).get(name, name): each for name, each in value.items()}
     fields = {field.name: field for field in dataclasses.fields(kind)}
     for name, field in fields.items():
@@ -178,13 +178,8 @@ def _read_fields(kind: Any, value: Any, where: str) -> Any:
         lists = {"missing": missing, "unknown": unknown, "known": list(fields) if unknown else []}
         said = (f"{name}: {', '.join(names)}" for name, names in lists.items() if names)
         raise ValueError(f"{where}: {'; '.join(said)}")
-    read = {name: _read(fields[name].type, v, f"{where}: {name}") for name, v in value.items()}
+    read = {name: parse(fields[name].type, v, f"{where}: {name}") for name, v in value.items()}
     try:
         return kind(**read)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
-
-
-def _expect(holds: bool, expected: str, value: Any, where: str) -> None:
-    if not holds:
-        raise ValueError(f"{where}: expected {expected}, found {value!r}")

@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from r2s._util.checks import expect_value as expect
 from r2s._util.files import write_json
 from r2s.estimation import estimate as estimates
 from r2s.estimation.estimate import Estimate
@@ -26,7 +27,6 @@ from r2s.materials.fabric_json import (
     LAWS,
     NUMBERS,
     check_keys,
-    expect,
     fabric_as_json,
     fabric_from_json,
     nan_to_null,

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from r2s._util.checks import expect_value as expect
 from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import NUMBERS, Fabric, check_fabric
 from r2s.materials.membrane import OrthotropicMembrane, SpringMembrane
@@ -82,12 +83,6 @@ def check_keys(stored: Any, expected: Iterable[str], where: str) -> None:
         raise ValueError(f"{prefix}missing: {', '.join(missing)}")
     if unknown := sorted(set(stored) - set(expected)):
         raise ValueError(f"{prefix}unknown: {', '.join(unknown)}; known: {', '.join(expected)}")
-
-
-def expect(holds: bool, where: str, expected: str, found: Any) -> None:
-    """Raise `ValueError` that says what was expected where, unless the condition holds."""
-    if not holds:
-        raise ValueError(f"{where}: expected {expected}, found {found!r}")
 
 
 def _law_as_json(law: Any, part: str) -> dict[str, Any]:

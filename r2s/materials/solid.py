@@ -198,11 +198,8 @@ def rotation_of(matrix: Matrix) -> Matrix:
 
 
 def _newton_polar(matrix: Matrix) -> Matrix:
-    first, second, third = matrix
-    cofactors = jnp.stack(
-        [jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)]
-    )
-    inverse = cofactors / jnp.sum(first * cofactors[0])  # transposed
+    cofactors = _cofactors(matrix)
+    inverse = cofactors / jnp.sum(matrix[0] * cofactors[0])  # transposed
     scale = (jnp.sum(inverse**2) / jnp.sum(matrix**2)) ** 0.25
     return (scale * matrix + inverse / scale) / 2
 
@@ -229,9 +226,13 @@ def _rotation_of_jvp(primals, tangents):
 
 def _solve(matrix: Matrix, right: Float[Array, " axis"]) -> Float[Array, " axis"]:
     """The solution of a symmetric 3 x 3 system, by cofactors."""
+    cofactors = _cofactors(matrix)
+    return jnp.sum(cofactors * right[:, None], axis=0) / jnp.sum(matrix[0] * cofactors[0])
+
+
+def _cofactors(matrix: Matrix) -> Matrix:
     a, b, c = matrix
-    cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
-    return jnp.sum(cofactors * right[:, None], axis=0) / jnp.sum(a * cofactors[0])
+    return jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
 
 
 def _identity(like: Matrix) -> Matrix:

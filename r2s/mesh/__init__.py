@@ -5,5 +5,5 @@
 - `strain_samples`: where its strain is taken, in triangles or quadrilaterals.
 - `bends`, `plate_elements`: where its curvature is taken, angles first.
 - `vectors`: vectors and small matrices as tuples of arrays.
-- `surface`: strains, normals and masses of a moved sheet; the nearest place to a point in space.
+- `surface`: normals and masses of a moved sheet; the nearest place to a point in space.
 """

@@ -68,7 +68,7 @@ class PlateElements(eqx.Module):
     def of_grid(cls, spacing: tuple[float, float], shape: tuple[int, int]) -> "PlateElements":
         """The vertices of a grid of `shape` vertices, [m] apart along warp and weft."""
         bends, (warp, weft, twist) = _grid_bends(spacing, shape)
-        areas = np.prod(spacing) * np.outer(*(np.r_[0.5, np.ones(n - 2), 0.5] for n in shape))
+        areas = grid_areas(spacing, shape)
         of_element = np.full((*shape, 4), -1)
         if warp:  # the turn nearest to each vertex on its line
             lines = np.arange(warp).reshape(-1, shape[1])
@@ -112,6 +112,13 @@ class PlateElements(eqx.Module):
         padded = jnp.pad(bends, ((0, 0), (0, 1), (0, 0)))
         of_element = padded[self.of_element[:, :, None], self.places]
         return jnp.einsum("eib,ebva->eiva", self.to_curvature, of_element)
+
+
+def grid_areas(
+    spacing: tuple[float, float], shape: tuple[int, int]
+) -> Float[np.ndarray, "along across"]:
+    """The share of each vertex in the area of a grid, [m^2]."""
+    return np.prod(spacing) * np.outer(*(np.r_[0.5, np.ones(n - 2), 0.5] for n in shape))
 
 
 def _vertices_of_elements(bends: Bends, of_element) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""A moved sheet: strains, normals and masses; points on its surface, the nearest to a point."""
+"""A moved sheet: normals and masses; points on its surface, the nearest to a point."""
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +7,6 @@ from jaxtyping import Array, Float, Int
 from r2s.mesh.mesh import Mesh
 
 Positions = Float[Array, "vertex 3"]
-
-
-def strains(mesh: Mesh, x: Positions) -> Float[Array, "sample 3"]:
-    """Green strain (E11, E22, 2 E12) [-] of every sample, at positions [m]."""
-    return mesh.samples.strains(x).reshape(-1, 3)
 
 
 def area_normals(mesh: Mesh, x: Positions) -> Float[Array, "element 3"]:

@@ -11,6 +11,11 @@ Vector = tuple[Number, Number, Number]
 Matrix = tuple[Vector, Vector, Vector]  # rows
 
 
+def columns(vectors: Array) -> Vector:
+    """The components of vectors (vector, 3, ...)."""
+    return vectors[:, 0], vectors[:, 1], vectors[:, 2]
+
+
 def add(*vectors: Vector) -> Vector:
     """The sum."""
     total = vectors[0]
@@ -58,18 +63,20 @@ def product(left: Matrix, right: Matrix) -> Matrix:
 
 def inverse(matrix: Matrix) -> Matrix:
     """By cofactors; infinite where the matrix is singular."""
-    first, second, third = matrix
-    rows = cross(second, third), cross(third, first), cross(first, second)
-    part = 1 / dot(first, rows[0])
-    one, two, three = transposed(rows)
+    part, (one, two, three) = _adjugate(matrix)
     return scale(part, one), scale(part, two), scale(part, three)
 
 
 @jax.jit
 def solve(matrix: Matrix, right: Vector) -> Vector:
     """The solution of three equations (Cramer's rule)."""
+    part, rows = _adjugate(matrix)
+    one, two, three = times(rows, right)
+    return part * one, part * two, part * three
+
+
+def _adjugate(matrix: Matrix) -> tuple[Number, Matrix]:
+    """One over the determinant, and the matrix that gives the inverse times it."""
     first, second, third = matrix
-    rows = cross(second, third), cross(third, first), cross(first, second)
-    part = 1 / dot(first, rows[0])
-    one, two, three = (part * dot(right, column) for column in transposed(rows))
-    return one, two, three
+    cofactors = cross(second, third), cross(third, first), cross(first, second)
+    return 1 / dot(first, cofactors[0]), transposed(cofactors)

@@ -20,7 +20,7 @@ from r2s.materials.membrane import TurnedMembrane
 from r2s.mesh.mesh import Mesh, corner, rectangle
 from r2s.mesh.mesh import resized as resized_mesh
 from r2s.recordings.recording import Recording, SheetPlacement, interpolated
-from r2s.scenarios.paths import Route
+from r2s.scenarios.paths import Route, ease
 from r2s.scenarios.sheet_solver import Braked, SheetSolver
 from r2s.solvers.implicit.cloth import MAX_ITERATIONS, ImplicitCloth, prepare_mesh
 from r2s.solvers.simulate import Solution, between, simulate
@@ -273,7 +273,7 @@ def _fan(sheet: SheetPlacement, wind: tuple[float, float, float]) -> Fan:
 def _gust(wind: tuple[float, float, float], begin: float):
     """A wind [m/s] that rises smoothly from `begin` [s] on, and its times [s]."""
     progress = np.linspace(0, 1, 13)
-    risen = (progress**2 * (3 - 2 * progress))[:, None] * np.asarray(wind)
+    risen = ease(progress)[:, None] * np.asarray(wind)
     return jnp.asarray(risen, float), jnp.asarray(begin + GUST * progress, float)
 
 

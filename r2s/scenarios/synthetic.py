@@ -6,10 +6,10 @@ error on a real fabric is larger. `record` takes any scenario, solver, mesh and 
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -205,11 +205,8 @@ def _clouds(x, scenario: Scenario, seen: Sensing, key) -> list[np.ndarray]:
 
 
 @eqx.filter_jit
-def _observe(x, faces, resolution: int, lowest, seen: Sensing, keys):
-    return jax.vmap(lambda x, key: _observe_frame(x, faces, resolution, lowest, seen, key))(x, keys)
-
-
-def _observe_frame(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, seen: Sensing, key):
+@partial(eqx.filter_vmap, in_axes=(0, None, None, None, None, 0))
+def _observe(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, seen: Sensing, key):
     """Noisy points of the surface, and which of them the cameras record."""
     key_pick, key_noise, key_where = jr.split(key, 3)
     surface = sample(x, faces, resolution)

@@ -152,23 +152,20 @@ def _run(solver, fabric, state, control, keep_solutions: bool, saves):
 
     step = jax.checkpoint(step, policy=policy)
 
-    def group(state, control):
-        state, failures = jax.lax.scan(step, state, control)
-        return state, (state.x, state.v, failures)
-
-    def wanted(state, at):
+    def group(state, at):
         number, control = at
 
-        none = jnp.broadcast_to(no_failure(), control.pinned.shape[:1])
-        still = state, (state.x, state.v, none)
-        return jax.lax.cond(number < saves, lambda: group(state, control), lambda: still)
+        def moved():
+            end, failures = jax.lax.scan(step, state, control)
+            return end, (end.x, end.v, failures)
 
-    if saves is None:
-        state, saved = jax.lax.scan(jax.checkpoint(group, policy=policy), state, control)
-    else:
-        numbers = jnp.arange(control.pinned.shape[0])
-        wanted = jax.checkpoint(wanted, policy=policy)
-        state, saved = jax.lax.scan(wanted, state, (numbers, control))
+        if saves is None:
+            return moved()
+        none = jnp.broadcast_to(no_failure(), control.pinned.shape[:1])
+        return jax.lax.cond(number < saves, moved, lambda: (state, (state.x, state.v, none)))
+
+    numbers = jnp.arange(control.pinned.shape[0])
+    state, saved = jax.lax.scan(jax.checkpoint(group, policy=policy), state, (numbers, control))
     return state, *saved
 
 

@@ -66,19 +66,21 @@ def stream(
     devices = all_devices() if devices is None else devices
     count = _length(members)
     size = -(-min(chunk, count) // devices.size) * devices.size
-    run = _sharded(function, devices)
+    batch, spec = jax.vmap(function), PartitionSpec(AXIS)
+    # without the check, which would refuse loops that begin with constants
+    run = jax.shard_map(batch, mesh=devices, in_specs=spec, out_specs=spec, check_vma=False)
     compiled = like = None
     for first in range(0, count, size):
         part = _part(members, slice(first, first + size))
         kept = min(size, count - first)
         path = None if folder is None else folder / f"{first:08d}-{_digest(part)}.eqx"
         if path is not None and path.exists():
-            like = jax.eval_shape(jax.vmap(function), part) if like is None else like
+            like = jax.eval_shape(batch, part) if like is None else like
             yield first, _read(path, like, kept)
             continue
         shards = _shard(part, size, devices)
         if compiled is None:
-            compiled = run.lower(shards).compile()
+            compiled = jax.jit(run).lower(shards).compile()
             check(planned(compiled), f"a chunk of {size} members", f"take a chunk below {size}")
         results = compiled(shards)
         if jax.process_count() > 1:
@@ -95,16 +97,6 @@ def stream(
 def all_devices() -> Mesh:
     """A mesh of all devices of all processes, along the members."""
     return jax.make_mesh((jax.device_count(),), (AXIS,), axis_types=(AxisType.Auto,))
-
-
-def _sharded(function: Callable[[Any], Any], devices: Mesh) -> Callable[[Any], Any]:
-    spec = PartitionSpec(AXIS)
-    # without the check, which would refuse loops that begin with constants
-    return jax.jit(
-        jax.shard_map(
-            jax.vmap(function), mesh=devices, in_specs=spec, out_specs=spec, check_vma=False
-        )
-    )
 
 
 def _length(members: Any) -> int:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from r2s._util.units import isotropic_bending, isotropic_membrane
 from r2s.materials.membrane import OrthotropicMembrane, SpringMembrane
 from r2s.mesh.mesh import Mesh, rectangle
-from r2s.mesh.surface import strains
+from r2s.mesh.strain_samples import on_samples
 
 few = settings(max_examples=25, deadline=None)
 CELL = SIZE / (SHAPE[0] - 1)  # side of the sheet's squares, [m]
@@ -40,7 +40,7 @@ def test_uniform_strain_is_exact(name, degrees, sheet, fabric):
     x = jnp.pad(sheet.rest @ gradient.T, ((0, 0), (0, 1))) @ rotation(0.7, 0).T
     (e11, half), (_, e22) = turn @ (gradient.T @ gradient - np.eye(2)) @ turn.T / 2
     density = (300 * e11**2 + 2 * 60 * e11 * e22 + 200 * e22**2 + 80 * (2 * half) ** 2) / 2
-    found = strains(mesh, x)
+    found = mesh.samples.strains(x).reshape(-1, 3)
     assert found == pytest.approx(np.tile([e11, e22, 2 * half], (len(found), 1)), abs=1e-13)
     assert stored_energy(mesh, fabric, x) == pytest.approx(SIZE**2 * density, rel=1e-12)
     force = forces(mesh, fabric, x)
@@ -52,7 +52,7 @@ def test_uniform_strain_is_exact(name, degrees, sheet, fabric):
 @few
 def test_rigid_motion_neither_strains_nor_pulls(sheet, fabric, angle, axis, shift):
     x = flat(sheet) @ rotation(angle, axis).T + jnp.array([shift])
-    assert jnp.max(jnp.abs(strains(sheet, x))) < 1e-13  # rounding of shifts up to 5 m
+    assert jnp.max(jnp.abs(sheet.samples.strains(x))) < 1e-13  # rounding of shifts up to 5 m
     assert jnp.max(jnp.abs(forces(sheet, fabric, x))) < 1e-12  # [N]
 
 
@@ -91,7 +91,9 @@ def test_energy_is_positive_for_any_strain(c11, c22, c33, coupling, strain):
 @eqx.filter_jit
 def membrane_energy(mesh, membrane, x):
     """Energy [J] in the strains alone."""
-    return jnp.sum(mesh.samples.areas.ravel() * jax.vmap(membrane.energy_density)(strains(mesh, x)))
+    return jnp.sum(
+        mesh.samples.areas * on_samples(membrane.energy_density, mesh.samples.strains(x))
+    )
 
 
 def spring_energy(x, first, second, constant, length):

@@ -15,7 +15,6 @@ from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
 from r2s.materials.tables import HINGE_FACTOR, TableBending
 from r2s.mesh.mesh import rectangle
-from r2s.mesh.surface import strains
 from r2s.recordings.recording import RecordingInfo, make_recording
 from r2s.scenarios.energy import stored_energy
 from r2s.scenarios.paths import Route
@@ -31,7 +30,8 @@ account = eqx.filter_jit(scenarios.energy_balance)
 
 def stretch(mesh, x):
     """The greatest principal stretch less one [-] of every strain sample, (frame, sample)."""
-    e11, e22, shear = np.asarray(jax.vmap(lambda x: strains(mesh, x))(x)).transpose(2, 0, 1)
+    found = np.asarray(jax.vmap(mesh.samples.strains)(x))
+    e11, e22, shear = found.reshape(len(found), -1, 3).transpose(2, 0, 1)
     return np.sqrt(1 + e11 + e22 + np.hypot(e11 - e22, shear)) - 1
 
 

@@ -1,4 +1,7 @@
-"""The cloth in time: conservation laws, statics, order of convergence, and the step's algebra."""
+"""The cloth in time: conservation laws, the algebra of its steps, and fabrics at the extremes."""
+
+import dataclasses
+import itertools
 
 import equinox as eqx
 import jax
@@ -31,22 +34,20 @@ from r2s.scenarios.scenario import rollout
 from r2s.scenarios.standard import lifting
 from r2s.solvers.implicit.cloth import ImplicitState
 from r2s.solvers.implicit.potential import hessian, potential, residual
+from r2s.solvers.simulate import simulate
 
 LAW = (300.0, 60.0, 200.0, 80.0)  # [N/m]
 STEPS = np.arange(21)
 
 
 @pytest.mark.slow(group="cloth")
-def test_free_fall_is_exact(sheet, fabric):
+@pytest.mark.parametrize("spectral_radius", [None, 0.6], ids=["BDF2", "alpha"])
+def test_free_fall_is_exact(sheet, fabric, spectral_radius):
     # BDF2 differentiates parabolas exactly, given a point of the parabola before the start
     x, v, g = flat(sheet) @ rotation(0.5, 0).T, [0.3, 0.0, 1.0], [0.0, 0.0, -GRAVITY]
     v, g = everywhere(v, sheet), everywhere(g, sheet)
-    states = roll(
-        cloth(sheet),
-        fabric,
-        ImplicitState(x, v, x - DT * v + DT**2 / 2 * g, v - DT * g),
-        20,
-    )
+    solver = dataclasses.replace(cloth(sheet), spectral_radius=spectral_radius)
+    states = roll(solver, fabric, solver.init(x, v, g), 20)
     x, v, g = (np.asarray(array) for array in (x, v, g))
     exact = np.stack([x + t * v + t**2 / 2 * g for t in STEPS * DT])
     assert states.x == pytest.approx(exact, abs=1e-10)  # tolerance of the solve, 1e-11 m a step
@@ -196,6 +197,29 @@ def test_extreme_fabrics_stay_finite(is_double):
             states = roll(solver, fabric, solver.init(start), 10, path)
             assert states.x.dtype == (np.float64 if is_double else np.float32)
             assert np.all(np.isfinite(states.x))
+
+
+@pytest.mark.slow(group="cloth")
+@pytest.mark.parametrize("table", [None, 0.0])
+def test_every_fabric_of_the_range_of_estimates_has_a_finite_gradient(table):
+    """In single precision, in air and on a table."""
+    with jax.enable_x64(False):
+        mesh = rectangle((0.3, 0.3), (9, 9))
+        solver = cloth(mesh, pinned=(0,), table=table, air=1.2, dt=1 / 60)
+        along = jnp.minimum(jnp.arange(1, 61) / 60, 1.0)
+        path = jnp.stack([0.1 * along, 0.1 * along, 1e-3 + 0.2 * along], axis=-1)
+        control, start = Control(path[:, None]), solver.init(flat(mesh, 1e-3))
+
+        @eqx.filter_jit
+        @jax.value_and_grad
+        def end(fabric):
+            return jnp.mean(simulate(solver, fabric, start, control, save_every=3).x[-1] ** 2)
+
+        for c11, c22, bending in itertools.product((3.0, 1e4), (3.0, 1e4), (1e-7, 1e-3)):
+            law = (c11, 0.2 * (c11 * c22) ** 0.5, c22, 0.3 * min(c11, c22))
+            numbers = np.array(jax.tree.leaves(end(Fabric.make(0.05, law, bending))))
+            assert numbers.dtype == np.float32
+            assert np.all(np.isfinite(numbers)), (c11, c22, bending)
 
 
 @pytest.mark.slow(group="cloth")

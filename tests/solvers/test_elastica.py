@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import cloth, flat, roll
+from conftest import cloth, flat, roll, strip
 from elastica import elastica
 from scipy.linalg import eigh
 
@@ -20,21 +20,12 @@ from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import OrthotropicPlate, PlateBending
-from r2s.mesh.mesh import rectangle
-from r2s.mesh.surface import strains
 
 LENGTH = 0.2  # [m], with the held cell
 DENSITY = 0.2  # [kg/m^2]
 LONG = 5.0  # [s]: in a step as long as this, inertia and damping hardly count
 STEPS = 12
 MEMBRANE = (1e4, 0.0, 1e4, 5e3)  # C11, C12, C22, C33 [N/m]: strains are below 1e-4
-
-
-def strip(cells: int, axis: int, across: int = 2, elements: str = "quadrilaterals"):
-    """A strip of square cells, along warp (0) or weft (1)."""
-    size, shape = [across * LENGTH / cells] * 2, [across + 1] * 2
-    size[axis], shape[axis] = LENGTH, cells + 1
-    return rectangle((size[0], size[1]), (shape[0], shape[1]), elements)
 
 
 def clamped_at(elements: str) -> float:
@@ -82,7 +73,8 @@ def rest(mesh, along, law, start):
 
 def tip(cells: int, axis: int, law, elements: str):
     """Where the tip of a strip comes to rest [free length], from the clamp: ahead and down."""
-    mesh, cell = strip(cells, axis, elements=elements), LENGTH / cells
+    cell = LENGTH / cells
+    mesh = strip(axis, (LENGTH, 2 * cell), (cells, 2), elements)
     along = np.asarray(mesh.rest[:, axis])
     end = rest(mesh, along, law, flat(mesh))[along > LENGTH - cell / 2].mean(axis=0)
     held = clamped_at(elements) * cell
@@ -118,7 +110,7 @@ def test_the_tip_converges_to_the_elastica_to_second_order(number, elements):
 
 def heights_matrix(cells: int, law, across: int = 2, elements: str = "quadrilaterals"):
     """A strip, and the second derivative [N/m] of its bending energy in the heights, when flat."""
-    mesh = strip(cells, 0, across, elements)
+    mesh = strip(0, (LENGTH, across * LENGTH / cells), (cells, across), elements)
 
     def raised(height):
         return jnp.concatenate([mesh.rest, height[:, None]], axis=1)
@@ -194,14 +186,12 @@ def prestress(mesh, free):
     count = mesh.rest.shape[0]
 
     def grown(moved):
-        return strains(mesh, jnp.pad(mesh.rest + moved, ((0, 0), (0, 1))))
+        return mesh.samples.strains(jnp.pad(mesh.rest + moved, ((0, 0), (0, 1))))
 
     strain = np.asarray(jax.jit(jax.jacfwd(grown))(jnp.zeros((count, 2)))).reshape(-1, 3, 2 * count)
     c11, c12, c22, c33 = MEMBRANE
-    law, area = (
-        np.array([[c11, c12, 0], [c12, c22, 0], [0, 0, c33]]),
-        np.asarray(mesh.samples.areas).ravel(),
-    )
+    law = np.array([[c11, c12, 0], [c12, c22, 0], [0, 0, c33]])
+    area = np.asarray(mesh.samples.areas).ravel()
     stiffness = np.einsum("fsa,f,st,ftb->ab", strain, area, law, strain, optimize=True)
     weight = np.asarray(mesh.vertex_area)[:, None] * [0, -DENSITY * GRAVITY]
     both = np.repeat(free, 2)

@@ -69,7 +69,7 @@ def test_a_bar_rings_at_the_speed_of_its_waves(law):
     grid = Grid.covering((0.0, 0.0), (1.2, 0.3), spacing)
     x, volume = lattice((0.1, 0.1), (1.1, 0.1 + 2 * spacing), spacing / 2)
     material = solid(young, 0.0, density, law)
-    background = Background.make(grid, gravity=0.0)
+    background = Background(grid, gravity=0.0)
     period = 2 * length / math.sqrt(young / density)
     solver = Block.make(background, volume, material, period / 512)
     shape = jnp.cos(math.pi * (x[:, 0] - 0.1) / length)
@@ -88,7 +88,7 @@ def test_three_dimensions_repeat_two():
     """A body without Poisson effect that is the same all along y moves as in the plane."""
     spacing = 1 / 8
     flat, deep = (
-        Background.make(Grid.covering((0.0,) * axes, (1.0,) * axes, spacing), Table.make(0.3))
+        Background(Grid.covering((0.0,) * axes, (1.0,) * axes, spacing), Table.make(0.3))
         for axes in (2, 3)
     )
     material = solid(5e3, 0.0, friction=0.4)
@@ -137,7 +137,7 @@ def _tip_error(cells, young=1e6, density=1e3, length=1.0, height=0.2, gravity=0.
     grid = Grid.covering((-4 * spacing - 0.05, -0.3), (length + 0.1, height + 0.1), spacing)
     pitch = 1.875**2 * math.sqrt(young * inertia / (density * height)) / length**2  # [rad/s]
     material = solid(young, 0.0, density, mass_damping=1.6 * pitch)  # nearly critical
-    background = Background.make(grid, gravity=gravity)
+    background = Background(grid, gravity=gravity)
     solver = Block.make(background, volume, material, float(stable_step(background, material)))
     handle = jnp.array([[-4 * spacing, height / 2]])
     held = np.flatnonzero(np.asarray(x)[:, 0] < 0)

@@ -16,7 +16,7 @@ COUNT, CHANNELS = 7, 2
 def case(request):
     """A grid, and random particles, values, slopes and nodes."""
     axes, rng = request.param, np.random.default_rng(0)
-    grid = Grid.make((-1.0, 0.5, 2.0)[:axes], 0.1, (8, 7, 6)[:axes])
+    grid = Grid((-1.0, 0.5, 2.0)[:axes], 0.1, (8, 7, 6)[:axes])
     x = np.asarray(grid.lower) + rng.uniform(0.1, 0.35, (COUNT, axes))
     values = rng.normal(size=(COUNT, CHANNELS))
     slopes = rng.normal(size=(COUNT, CHANNELS, axes))
@@ -96,8 +96,8 @@ def test_a_grid_covers_what_it_should():
 
 def test_an_impossible_grid_is_refused():
     with pytest.raises(ValueError, match="2 or 3 axes"):
-        Grid.make((0.0,), 0.1, (8,))
+        Grid((0.0,), 0.1, (8,))
     with pytest.raises(ValueError, match="spacing"):
-        Grid.make((0.0, 0.0), 0.0, (8, 8))
+        Grid((0.0, 0.0), 0.0, (8, 8))
     with pytest.raises(ValueError, match="lower < upper"):
         Grid.covering((0.0, 0.0), (1.0, 0.0), 0.1)

@@ -5,13 +5,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DT, FIRST_ROW, SIZE, cloth, energy, flat, hanging, roll, rotation
+from conftest import (
+    DT,
+    FIRST_ROW,
+    SIZE,
+    cloth,
+    energy,
+    flat,
+    hanging,
+    roll,
+    rotation,
+    stretch_under,
+    strip,
+)
 
 from r2s._util.units import GRAVITY
 from r2s.environment.contact import PRESSURE_STIFFNESS, pressure
 from r2s.environment.scene import Control
 from r2s.materials.fabric import Fabric
-from r2s.mesh.mesh import Mesh, rectangle
+from r2s.mesh.mesh import Mesh
 from r2s.solvers.implicit.potential import residual
 
 LONG = 5.0  # [s]: in a step as long as this, inertia and damping hardly count
@@ -31,13 +43,9 @@ def pull(solver, fabric, states):
 
 
 def hung(law, axis: int, tension):
-    """Stretch along and across (-) of a strip under a tension per rest width [N/m].
-
-    St. Venant-Kirchhoff without stress across: tension = s (s^2 - 1) / 2 times a modulus.
-    """
+    """Stretch along and across (-) of a strip without stress across, under tensions [N/m]."""
     c11, c12, c22, _ = law if axis == 0 else (law[2], law[1], law[0], law[3])
-    modulus = c11 - c12**2 / c22
-    along = np.array([np.roots([modulus / 2, 0, -modulus / 2, -t]).real.max() for t in tension])
+    along = np.array([stretch_under(t, c11 - c12**2 / c22) for t in tension])
     return along, np.sqrt(1 - c12 / c22 * (along**2 - 1))
 
 
@@ -45,9 +53,7 @@ def hung(law, axis: int, tension):
 @pytest.mark.parametrize("law", [(20.0, 8.0, 12.0, 6.0), (900.0, 200.0, 1500.0, 100.0)])
 @pytest.mark.parametrize("axis", [0, 1], ids=["warp", "weft"])
 def test_a_hanging_strip_gets_longer_and_narrower_under_its_weight(axis, law):
-    size, shape = [WIDTH] * 2, [3, 3]
-    size[axis], shape[axis] = LENGTH, CELLS + 1
-    mesh = rectangle((size[0], size[1]), (shape[0], shape[1]))
+    mesh = strip(axis, (LENGTH, WIDTH), (CELLS, 2))
     below, across = LENGTH - np.asarray(mesh.rest[:, axis]), np.asarray(mesh.rest[:, 1 - axis])
     fabric = Fabric.make(DENSITY, law, 1e-6)
     top = below > LENGTH * (1 - 0.5 / CELLS)

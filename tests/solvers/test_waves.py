@@ -1,13 +1,13 @@
 """Standing waves of a strip, against the speeds of longitudinal, shear and transverse waves."""
 
+import conftest
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import cloth, flat, roll
+from conftest import cloth, flat, roll, stretch_under
 
 from r2s._util.units import GRAVITY
 from r2s.materials.fabric import Fabric
-from r2s.mesh.mesh import rectangle
 
 LENGTH, WIDTH = 0.2, 0.025  # [m]
 CELLS = 16  # along the strip
@@ -23,9 +23,7 @@ def strip(axis: int):
 
     Its cells do not wrinkle: without bending they would give way to half of every wave.
     """
-    size, shape = [WIDTH] * 2, [3, 3]
-    size[axis], shape[axis] = LENGTH, CELLS + 1
-    mesh = rectangle((size[0], size[1]), (shape[0], shape[1]), "quadrilaterals")
+    mesh = conftest.strip(axis, (LENGTH, WIDTH), (CELLS, 2), "quadrilaterals")
     return mesh, np.asarray(mesh.rest[:, axis])
 
 
@@ -70,17 +68,14 @@ def test_waves_in_the_plane_have_the_speed_of_their_stiffness(axis, kind):
 def hung(along, stiffness: float, tension: float):
     """Heights [m] of a strip that hangs with a tension [N/m] in its middle, and the stretch there.
 
-    Its nominal tension is C s (s^2 - 1) / 2 at a stretch s, and grows upwards by the weight below.
+    Its tension grows upwards by the weight below.
     """
-
-    def stretch(t):
-        return np.roots([stiffness / 2, 0, -stiffness / 2, -t]).real.max()
-
     cell = LENGTH / CELLS
     middles = cell * (np.arange(CELLS) + 0.5)
-    stretches = [stretch(tension + DENSITY * GRAVITY * (s - LENGTH / 2)) for s in middles]
+    tensions = tension + DENSITY * GRAVITY * (middles - LENGTH / 2)
+    stretches = [stretch_under(t, stiffness) for t in tensions]
     heights = cell * np.concatenate([[0], np.cumsum(stretches)])
-    return heights[np.rint(along / cell).astype(int)], stretch(tension)
+    return heights[np.rint(along / cell).astype(int)], stretch_under(tension, stiffness)
 
 
 @pytest.mark.slow(group="cloth")

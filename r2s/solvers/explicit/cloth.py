@@ -21,12 +21,11 @@ from r2s._util.units import Scalar
 from r2s.environment.contact import PRESSURE_STIFFNESS, SLIP_SPEED
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric, check_fabric
-from r2s.mesh.mesh import Mesh
-from r2s.mesh.vectors import Vector, add, scale, subtract
+from r2s.mesh.vectors import Vector, add, columns, scale, subtract
 from r2s.solvers.explicit.grid import Slices, grid_for
 from r2s.solvers.explicit.layout import batch_last
 from r2s.solvers.explicit.sheet import Cells, ForceInputs, Gathers, Memory, cells_of, no_memory
-from r2s.solvers.explicit.stability import RELAXATION, check_step, longest_sheet_step
+from r2s.solvers.explicit.stability import RELAXATION, check_step, stable_sheet_step
 from r2s.solvers.results import (
     Result,
     all_finite,
@@ -75,7 +74,7 @@ class ExplicitCloth(eqx.Module):
     - `scene`: sheet, pinned vertices, table, air, gravity. Its mesh must not be traced.
     - `dt`: step, [s]; another one is another program.
     - `fabric`: the stiffest that it will be used for, or a batch of all: it gives the substeps, the
-      fewest below `stable_step`.
+      fewest below `stable_sheet_step`.
     - `membrane_damping`: damping time of the membrane, [s]; None: the fabric's.
     - `relaxation`: of the membrane's viscosity, [s]; 0 is plain Kelvin-Voigt damping, in far
       shorter substeps.
@@ -150,12 +149,12 @@ class ExplicitCloth(eqx.Module):
 
     def fits(self, fabric: Fabric) -> Bool[Array, ""]:
         """Whether the substeps are short enough for a fabric, which may be traced."""
-        longest = stable_step(self.scene.mesh, fabric, self.membrane_damping, self.relaxation)
+        longest = stable_sheet_step(self.scene.mesh, fabric, self.membrane_damping, self.relaxation)
         return self.dt / self.substeps <= (1 + ROUNDING) * longest
 
     def _longest_substep(self, fabric: Fabric) -> float:
-        """The least `stable_step` [s] of a fabric, or of all members of a batch."""
-        limit = stable_step
+        """The least `stable_sheet_step` [s] of a fabric, or of all members of a batch."""
+        limit = stable_sheet_step
         for _ in range(jnp.ndim(fabric.density)):
             limit = eqx.filter_vmap(limit, in_axes=(None, 0, None, None))
         with jax.ensure_compile_time_eval():
@@ -226,7 +225,7 @@ class ExplicitCloth(eqx.Module):
         others = density, friction, mass_damping, gravity
         mass = density * layout.areas(start.x)
         contact = layout.row(inputs.table_height) + thickness
-        free, carried = inputs.is_free > 0, _columns(inputs.carried)
+        free, carried = inputs.is_free > 0, columns(inputs.carried)
 
         def substep(_, moving: _Moving) -> _Moving:
             force, memory = force_of(moving.x, moving.v, moving.memory)
@@ -241,7 +240,7 @@ class ExplicitCloth(eqx.Module):
             wide = layout.put(moving.x, placed), layout.put(moving.v, moved)
             return _Moving(*wide, memory, impulse)
 
-        impulse = None if inputs.impulse is None else _columns(inputs.impulse)
+        impulse = None if inputs.impulse is None else columns(inputs.impulse)
         moving = _Moving(layout.wide(start.x), layout.wide(start.v), memory, impulse)
         x, v, memory, impulse = jax.lax.fori_loop(0, self.substeps, substep, moving)
         impulse = None if impulse is None else jnp.stack(impulse, axis=1)
@@ -270,29 +269,10 @@ class _Inputs(NamedTuple):
     impulse: Array | None
 
 
-def _columns(vectors: Array) -> Vector:
-    return vectors[:, 0], vectors[:, 1], vectors[:, 2]
-
-
 def _failure(inputs: Any, results: Any) -> Int[Array, ""]:
     """Inputs that are not finite give `NON_FINITE`, results that are not `TIME_STEP`."""
     code = jnp.where(all_finite(results), Result.SUCCESS.value, Result.TIME_STEP.value)
     return jnp.where(all_finite(inputs), code, Result.NON_FINITE.value)
-
-
-@eqx.filter_jit
-def stable_step(
-    mesh: Mesh,
-    fabric: Fabric,
-    membrane_damping: Float[Array, ""] | float | None = None,
-    relaxation: Float[Array, ""] | float = RELAXATION,
-) -> Float[Array, ""]:
-    """The longest substep [s] that is stable for a fabric near its rest shape.
-
-    `membrane_damping`, `relaxation`: as in `ExplicitCloth`, [s]. The squares of the highest
-    frequencies of membrane and bending have bounds that add. Table and friction do not limit it.
-    """
-    return longest_sheet_step(mesh, fabric, membrane_damping, relaxation)
 
 
 def moved_velocity(

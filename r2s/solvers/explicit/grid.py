@@ -19,13 +19,7 @@ from r2s.environment.air import STILL, Air, Fan
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import OrthotropicPlate, PlateBending, PlateLaw
-from r2s.materials.wrinkling import (
-    Prepared,
-    follow,
-    mean_bending,
-    prepare_search,
-    relieved,
-)
+from r2s.materials.wrinkling import Prepared, follow, mean_bending, prepare_search, relieved
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.strain_samples import GAUSS
 from r2s.mesh.vectors import Vector, add, cross, dot, scale, subtract
@@ -169,8 +163,7 @@ class Slices(Layout):
 def sheet_force(mesh: Mesh, cells: Cells | None, inputs: ForceInputs) -> tuple[Vertices, Memory]:
     """Forces [N] of membrane, bending and air on the vertices, and what the samples remember.
 
-    `cells`: vertices along warp and weft of a rectangle of quadrilaterals, and the spacing between
-    them [m]; None: any mesh.
+    `cells`: those of `cells_of`, for a grid; None: any mesh.
     """
     cells = grid_for(cells, inputs.fabric)
     if cells is None:
@@ -223,11 +216,11 @@ def membrane_force(
     """Forces [N] on the corners of the cells, and what the samples remember of it."""
     samples = once(partial(_strains, layout), corners)
     one, two, three = (jnp.concatenate(row) for row in zip(*samples, strict=True))
-    strain, hidden, search = (one, two, three), before.hidden, None
-    if hidden is not None:
+    strain, search = (one, two, three), None
+    if before.hidden is not None:
         search = prepare_search(laws.membrane.elastic(strain)[1], laws.critical)
-        hidden = follow(search, strain, hidden)
-    of_axes = once(partial(_stress, laws, search), strain, hidden, before.relaxed, before.begun)
+        before = before._replace(hidden=follow(search, strain, before.hidden))
+    of_axes = once(partial(_stress, laws, search), strain, before)
     total, relaxed = zip(*of_axes, strict=True)
     length = layout.length(layout.first_cell)
     stresses = [parts(total, sample * length, length) for sample in range(len(SAMPLES))]
@@ -236,23 +229,16 @@ def membrane_force(
     area = jnp.asarray(layout.spacing[0] * layout.spacing[1] / 4, like.dtype)
     weight = jnp.where(layout.is_cell(like), -area, 0)
     forces = list(to_corners([scale(weight, stress) for stress in stresses])[0])
-    return forces, Memory(relaxed, hidden, jnp.ones_like(before.begun))
+    return forces, Memory(relaxed, before.hidden, jnp.ones_like(before.begun))
 
 
-def _stress(
-    laws: GridLaws,
-    search: Prepared | None,
-    strain: Vector,
-    hidden: Vector | None,
-    relaxed: Vector,
-    begun: Array,
-) -> list[tuple[Array, Array]]:
+def _stress(laws: GridLaws, search: Prepared | None, strain: Vector, memory: Memory):
     """With viscosity, and what the samples remember of it, for (11, 22, 12)."""
     stress, _ = laws.membrane.elastic(strain)
-    if search is not None and hidden is not None:
-        stress = add(stress, relieved(search, hidden))
-    axes = zip(stress, relaxed, strict=True)
-    return [laws.viscosity.resist(now, past, begun) for now, past in axes]
+    if search is not None:
+        stress = add(stress, relieved(search, memory.hidden))
+    axes = zip(stress, memory.relaxed, strict=True)
+    return [laws.viscosity.resist(now, past, memory.begun) for now, past in axes]
 
 
 def _strains(layout: Layout, corners: Corners) -> list[Vector]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from r2s._util.arrays import once
+from r2s.mesh.plate_elements import grid_areas
 from r2s.mesh.vectors import Vector, add, cross, dot, scale, subtract
 from r2s.solvers.explicit.layout import Layout, part, parts
 
@@ -140,7 +141,8 @@ def _curvature(layout: Layout, angles: list[Array]) -> Vector:
 
 def _of_cell(layout: Layout) -> np.ndarray:
     """The share of a cell's twist in the curvature 2 k12 of the vertex that is its origin."""
-    share = np.sqrt(np.prod(layout.spacing) / layout.vertex_areas) / 2
+    areas = grid_areas(layout.spacing, layout.shape)
+    share = np.sqrt(np.prod(layout.spacing) / areas) / 2
     share[-1], share[:, -1] = 0, 0
     return share
 

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from r2s.mesh.vectors import Vector
+from r2s.mesh.plate_elements import grid_areas
+from r2s.mesh.vectors import Vector, columns
 
 
 class Layout(NamedTuple):
@@ -64,15 +65,7 @@ class Layout(NamedTuple):
 
     def areas(self, like: Array) -> Array:
         """Rest areas of the vertices, [m^2]."""
-        return self.constant(self.vertex_areas, 0, like)
-
-    @property
-    def vertex_areas(self) -> np.ndarray:
-        """Rest areas of the vertices, [m^2], as a matrix."""
-        along = [np.ones(count) for count in self.shape]
-        for each in along:
-            each[[0, -1]] = 0.5
-        return np.prod(self.spacing) * np.outer(*along)
+        return self.constant(grid_areas(self.spacing, self.shape), 0, like)
 
     def row(self, number: Array) -> Array:
         """A number of each member, for arrays (place, member)."""
@@ -85,8 +78,7 @@ class Layout(NamedTuple):
 
     def wide(self, x: Array) -> Vector:
         """Components of vectors of the vertices (vertex, 3, ...), with room on either side."""
-        one, two, three = (self.padded(x[:, i], self.room, self.room) for i in range(3))
-        return one, two, three
+        return columns(self.padded(x, self.room, self.room))
 
     def inner(self, x: Vector) -> Vector:
         """What has room on either side without it."""
@@ -99,13 +91,11 @@ class Layout(NamedTuple):
 
     def to_cells(self, samples: Array) -> Vector:
         """Vectors (cell, sample, 3, ...) of the cells alone: a row of all places of each sample."""
-        rows, columns = self.shape
-        cells = samples.reshape(rows - 1, columns - 1, *samples.shape[1:])
+        cells = samples.reshape(self.shape[0] - 1, self.shape[1] - 1, *samples.shape[1:])
         widths = [(0, 1), (0, 1)] + [(0, 0)] * (cells.ndim - 2)
         flat = jnp.pad(cells, widths).reshape(self.count, *samples.shape[1:])
         wide = jnp.moveaxis(self.padded(flat, -self.first_cell, 0), 1, 0)
-        row = wide.reshape(-1, *samples.shape[2:])
-        return row[:, 0], row[:, 1], row[:, 2]
+        return columns(wide.reshape(-1, *samples.shape[2:]))
 
     def from_cells(self, row: Vector) -> Array:
         """The reverse of `to_cells`."""

@@ -4,7 +4,6 @@ Strains, curvatures and laws are those of `r2s.ImplicitCloth`; here they give fo
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,11 +15,11 @@ from r2s.environment.air import Air, Fan, drag_on_vertices
 from r2s.materials.fabric import Fabric
 from r2s.materials.wrinkling import membrane_on_samples, stress_on_samples
 from r2s.mesh.mesh import Mesh
-from r2s.mesh.surface import strains
-from r2s.mesh.vectors import Vector
+from r2s.mesh.vectors import Vector, columns
 from r2s.solvers.explicit.stability import Viscosity
 
 Vertices = Float[Array, "vertex 3"]
+OfSamples = Float[Array, "element sample 3"]
 Cells = tuple[tuple[int, int], tuple[float, float]]
 
 
@@ -96,7 +95,7 @@ class Gathers(NamedTuple):
 
     def wide(self, x: Vertices) -> Vector:
         """Components of vectors of the vertices."""
-        return x[:, 0], x[:, 1], x[:, 2]
+        return columns(x)
 
     def inner(self, x: Vector) -> Vector:
         """Those of the vertices alone."""
@@ -126,26 +125,24 @@ class Gathers(NamedTuple):
 def force_by_gathers(mesh: Mesh, inputs: ForceInputs) -> tuple[Vertices, Memory]:
     """Forces [N] of membrane, bending and air on the vertices, and what the samples remember."""
     fabric, viscosity, air, fan, x, v, wind, memory = inputs
-    past = memory.relaxed.reshape(-1, 3)
     stress = membrane_stress(mesh, fabric, x)
-    stress, relaxed = viscosity.resist(stress, past, memory.begun)
+    stress, relaxed = viscosity.resist(stress, memory.relaxed, memory.begun)
     force = membrane_force(mesh, x, stress) + bending_force(mesh, fabric, x, v)
     force += drag_on_vertices(mesh, air, fan, x, v, wind)
-    relaxed = relaxed.reshape(memory.relaxed.shape)
     return force, Memory(relaxed, memory.hidden, jnp.ones_like(memory.begun))
 
 
-def membrane_stress(mesh: Mesh, fabric: Fabric, x: Vertices) -> Float[Array, "sample 3"]:
+def membrane_stress(mesh: Mesh, fabric: Fabric, x: Vertices) -> OfSamples:
     """Of all strain samples at positions [m], [N/m]."""
     strain = mesh.samples.strains(x)
     laws = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
-    return stress_on_samples(laws, strain).reshape(-1, 3)
+    return stress_on_samples(laws, strain)
 
 
-def membrane_force(mesh: Mesh, x: Vertices, stress: Float[Array, "sample 3"]) -> Vertices:
+def membrane_force(mesh: Mesh, x: Vertices, stress: OfSamples) -> Vertices:
     """Forces [N] of stresses [N/m] on the vertices."""
-    _, to_forces = jax.vjp(partial(strains, mesh), x)
-    return -to_forces(mesh.samples.areas.reshape(-1)[:, None] * stress)[0]
+    _, to_forces = jax.vjp(mesh.samples.strains, x)
+    return -to_forces(mesh.samples.areas[:, :, None] * stress)[0]
 
 
 def bending_force(mesh: Mesh, fabric: Fabric, x: Vertices, v: Vertices) -> Vertices:

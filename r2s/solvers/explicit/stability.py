@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,16 +45,21 @@ class Viscosity(NamedTuple):
         return stress + self.share * ahead, stress + (self.rate - 1) * ahead
 
 
-def longest_sheet_step(
+@eqx.filter_jit
+def stable_sheet_step(
     mesh: Mesh,
     fabric: Fabric,
-    membrane_damping: Scalar | None,
-    relaxation: Scalar,
+    membrane_damping: Scalar | None = None,
+    relaxation: Scalar = RELAXATION,
     others: Sequence[tuple[Scalar, Scalar]] = (),
 ) -> Float[Array, ""]:
-    """`longest_relaxing_step` of a fabric's membrane and bending, and `others`.
+    """The longest step [s] that is stable for a fabric near its rest shape.
 
-    `membrane_damping`: [s]; None: the fabric's.
+    - `membrane_damping`, `relaxation`: as in `ExplicitCloth`, [s].
+    - `others`: more parts, as the `squares` of `longest_step`.
+
+    The squares of the highest frequencies of membrane and bending have bounds that add. Table and
+    friction do not limit it.
     """
     damping = fabric.damping if membrane_damping is None else jnp.asarray(membrane_damping, float)
     bending = bending_frequency(mesh, fabric), fabric.damping

@@ -1,8 +1,8 @@
 """The cloth: a sheet of triangles, implicit in time, second order, differentiable.
 
 `ImplicitCloth.step` sets up the potential of the step (`potential`), Newton's method minimises it
-(`newton`) with a sparse factor (`linear`), and where the sheet touches itself that is repeated with
-the contacts that it was found to need (`self_contact`).
+(`newton`) with a sparse factor (`system`), and where the sheet touches itself that is repeated with
+the contacts that it was found to need (`r2s.solvers.contact`).
 """
 
 import dataclasses
@@ -27,13 +27,7 @@ from r2s.solvers.implicit.generalised_alpha import by_generalised_alpha, rates_a
 from r2s.solvers.implicit.newton import minimise
 from r2s.solvers.implicit.potential import IncrementalPotential, residual
 from r2s.solvers.implicit.system import Elimination
-from r2s.solvers.results import (
-    LONGEST,
-    Result,
-    check_step_arguments,
-    first_failure,
-    no_failure,
-)
+from r2s.solvers.results import LONGEST, Result, check_step_arguments, first_failure, no_failure
 
 Positions = Float[Array, "vertex 3"]
 

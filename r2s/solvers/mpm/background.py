@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from r2s._util.arrays import as_floats
 from r2s._util.units import GRAVITY
 from r2s.environment.contact import SLIP_SPEED, Table
 from r2s.solvers.mpm.grid import Grid
@@ -37,32 +38,24 @@ class Background(eqx.Module):
     - `mass_floor`: mass added to every node, over the mean mass of a particle [-].
     - `forward_mode`: whether JAX derives the transfers itself, so that `jax.jvp` works; the own
       rules, which are the default, have a faster reverse mode.
+
+    Raises `ValueError` for impossible walls or mass floor.
     """
 
     grid: Grid
-    table: Table | None
-    gravity: Float[Array, ""]
+    table: Table | None = None
+    gravity: Float[Array, ""] = eqx.field(default=GRAVITY, converter=as_floats)
     walls: int = eqx.field(static=True, default=0)
     mass_floor: float = eqx.field(static=True, default=1e-15)
     forward_mode: bool = eqx.field(static=True, default=False)
 
-    @classmethod
-    def make(
-        cls,
-        grid: Grid,
-        table: Table | None = None,
-        gravity: Float[Array, ""] | float = GRAVITY,
-        walls: int = 0,
-        mass_floor: float = 1e-15,
-        forward_mode: bool = False,
-    ) -> "Background":
-        """A background from numbers. Raises `ValueError` for impossible walls or mass floor."""
-        if not 0 <= walls < min(grid.shape) / 2 or mass_floor < 0:
+    def __check_init__(self) -> None:
+        least = min(self.grid.shape)
+        if not 0 <= self.walls < least / 2 or self.mass_floor < 0:
             raise ValueError(
-                f"walls must be from 0 to less than half of {min(grid.shape)} nodes and the mass "
-                f"floor >= 0, got {walls} and {mass_floor}"
+                f"walls must be from 0 to less than half of {least} nodes and the mass floor >= 0, "
+                f"got {self.walls} and {self.mass_floor}"
             )
-        return cls(grid, table, jnp.asarray(gravity, float), walls, mass_floor, forward_mode)
 
     def advance(
         self,

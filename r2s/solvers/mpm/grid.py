@@ -1,4 +1,4 @@
-"""The grid of the material point method: its nodes, and which particles are inside."""
+"""The grid of the material point method: its nodes, which particles are inside, and failures."""
 
 import math
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from r2s._util.arrays import as_floats
 from r2s.solvers.results import Result, all_finite
 
 REACH = 2  # nodes that a particle needs beyond it, on each side
@@ -22,18 +23,16 @@ class Grid(eqx.Module):
     - `lower`: position of the first node, [m].
     - `spacing`: distance between nodes, [m].
     - `shape`: number of nodes along each axis.
+
+    Raises `ValueError` when it is not 2-D or 3-D, or has too few or too many nodes.
     """
 
-    lower: Float[Array, " axis"]
+    lower: Float[Array, " axis"] = eqx.field(converter=as_floats)
     spacing: float = eqx.field(static=True)
     shape: tuple[int, ...] = eqx.field(static=True)
 
-    @classmethod
-    def make(cls, lower: tuple[float, ...], spacing: float, shape: tuple[int, ...]) -> "Grid":
-        """A grid from its fields, as numbers.
-
-        Raises `ValueError` when it is not 2-D or 3-D, or has too few or too many nodes.
-        """
+    def __check_init__(self) -> None:
+        lower, spacing, shape = self.lower, self.spacing, self.shape
         if len(shape) not in (2, 3) or len(lower) != len(shape):
             raise ValueError(f"a grid has 2 or 3 axes, got lower {lower} and shape {shape}")
         if not spacing > 0 or min(shape) < 2 * REACH or math.prod(shape) > MAX_NODES:
@@ -41,7 +40,6 @@ class Grid(eqx.Module):
                 f"a grid needs a spacing > 0 m, at least {2 * REACH} nodes along each axis and at "
                 f"most {MAX_NODES} in all, got {spacing} m and {shape}"
             )
-        return cls(jnp.asarray(lower, float), float(spacing), tuple(shape))
 
     @classmethod
     def covering(
@@ -57,7 +55,7 @@ class Grid(eqx.Module):
             )
         first = tuple(a - margin * spacing for a in lower)
         cells = [math.ceil((b - a) / spacing - 1e-9) for a, b in zip(lower, upper, strict=True)]
-        return cls.make(first, spacing, tuple(count + 1 + 2 * margin for count in cells))
+        return cls(first, spacing, tuple(count + 1 + 2 * margin for count in cells))
 
     @property
     def axes(self) -> tuple[Float[Array, " ..."], ...]:

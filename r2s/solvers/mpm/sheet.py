@@ -21,7 +21,7 @@ from r2s.materials.fabric import Fabric, check_fabric
 from r2s.mesh.mesh import Mesh
 from r2s.solvers.explicit.grid import sheet_force
 from r2s.solvers.explicit.sheet import Cells, ForceInputs, Memory, cells_of, no_memory
-from r2s.solvers.explicit.stability import RELAXATION, check_step, longest_sheet_step
+from r2s.solvers.explicit.stability import RELAXATION, check_step, stable_sheet_step
 from r2s.solvers.mpm.background import Background
 from r2s.solvers.mpm.grid import Grid, failure_of_step
 from r2s.solvers.mpm.transfer import affine_factor
@@ -156,9 +156,7 @@ class MPMCloth(eqx.Module):
         if background is None:
             if grid is None:
                 raise ValueError("expected a grid, or a background")
-            background = Background.make(
-                grid, scene.table, scene.gravity, forward_mode=forward_mode
-            )
+            background = Background(grid, scene.table, scene.gravity, forward_mode=forward_mode)
         self.background, grid = background, background.grid
         edge = longest_edge(scene.mesh)
         if edge > COARSEST * grid.spacing:
@@ -275,7 +273,7 @@ def stable_step(
     The grid only lowers the frequencies of the mesh.
     """
     layers = between_layers().frequency(fabric.density, spacing), jnp.zeros((), float)
-    return longest_sheet_step(mesh, fabric, membrane_damping, relaxation, [layers])
+    return stable_sheet_step(mesh, fabric, membrane_damping, relaxation, [layers])
 
 
 def between_layers() -> Transverse:
