@@ -15,10 +15,10 @@ SHEET = r2s.rectangle((0.2, 0.2), (3, 3))
 FABRIC = r2s.presets.grey_interlock()
 SCENE = r2s.Scene(SHEET, pinned=[0, 2])
 GRID = Grid.covering((-0.3, -0.3, -0.3), (0.5, 0.5, 0.3), 0.1)
-SOLVERS = {
-    "implicit": lambda: r2s.ImplicitCloth(SCENE, 0.01),
-    "explicit": lambda: r2s.ExplicitCloth(SCENE, 0.01, FABRIC),
-    "mpm": lambda: r2s.MPMCloth(SCENE, 1e-4, FABRIC, GRID),
+SOLVERS = {  # of a scene, and a grid around it
+    "implicit": lambda scene, grid: r2s.ImplicitCloth(scene, 0.01),
+    "explicit": lambda scene, grid: r2s.ExplicitCloth(scene, 1e-3, FABRIC),
+    "mpm": lambda scene, grid: r2s.MPMCloth(scene, 1e-4, FABRIC, grid),
 }
 FREE = r2s.ImplicitCloth(r2s.Scene(SHEET, air=None), 0.01)
 START = SHEET.lay_flat()
@@ -27,7 +27,7 @@ CONTROL = r2s.Control(START[jnp.array([0, 2])])
 
 @pytest.fixture(params=SOLVERS)
 def solver(request, unchecked):
-    return SOLVERS[request.param]()
+    return SOLVERS[request.param](SCENE, GRID)
 
 
 @pytest.mark.parametrize(
@@ -108,20 +108,14 @@ def test_a_value_that_makes_no_sense_is_named(call, error, words, unchecked):
 def test_a_start_takes_the_precision_of_the_solver(name, dtype, unchecked):
     with jax.enable_x64(True):
         sheet = r2s.rectangle((2.0, 2.0), (3, 3))
-        scene = r2s.Scene(sheet, pinned=[0])
         grid = Grid.covering((-3, -3, -3), (5, 5, 3), 1.0)
-        solver = {
-            "implicit": lambda: r2s.ImplicitCloth(scene, 0.01),
-            "explicit": lambda: r2s.ExplicitCloth(scene, 1e-3, FABRIC),
-            "mpm": lambda: r2s.MPMCloth(scene, 1e-4, FABRIC, grid),
-        }[name]()
+        solver = SOLVERS[name](r2s.Scene(sheet, pinned=[0]), grid)
         flat = np.asarray(sheet.lay_flat())
         start = flat.tolist() if dtype is list else flat.astype(dtype)
         state = solver.init(start, start, None)
         expected = jax.eval_shape(solver.init, jnp.asarray(flat), jnp.asarray(flat))
-        assert jax.tree.map(lambda leaf: leaf.dtype, state) == jax.tree.map(
-            lambda leaf: leaf.dtype, expected
-        )
+        found, kinds = (jax.tree.map(lambda leaf: leaf.dtype, each) for each in (state, expected))
+        assert found == kinds
         np.testing.assert_array_equal(state.x, flat)
 
 
