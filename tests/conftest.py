@@ -53,6 +53,7 @@ gc.set_threshold(100_000, 50, 100)
 jax.config.update("jax_enable_x64", True)
 hypothesis.settings.register_profile("r2s", deadline=None)  # a first example compiles
 hypothesis.settings.load_profile("r2s")
+few = hypothesis.settings(max_examples=25)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

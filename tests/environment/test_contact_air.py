@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DT, cloth, directional_difference, everywhere, flat, roll
-from hypothesis import given, settings
+from conftest import DT, cloth, directional_difference, everywhere, few, flat, roll
+from hypothesis import given
 from hypothesis import strategies as st
 
 from r2s._util.units import AIR_DENSITY, GRAVITY
@@ -21,7 +21,6 @@ from r2s.environment.contact import (
 )
 from r2s.materials.fabric import Fabric
 
-few = settings(max_examples=25, deadline=None)
 REST_DEPTH = (0.2 * GRAVITY / PRESSURE_STIFFNESS) ** 0.5  # [m], where pressure carries 0.2 kg/m^2
 
 

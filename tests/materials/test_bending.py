@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import directional_difference
-from hypothesis import given, settings
+from conftest import directional_difference, few
+from hypothesis import given
 from hypothesis import strategies as st
 
 from r2s.mesh.bends import hinge_angle, unwrapped
@@ -49,7 +49,7 @@ def hinge(angle):
 
 
 @given(st.floats(-3.1, 3.1))
-@settings(max_examples=25, deadline=None)
+@few
 def test_the_angle_is_signed_and_goes_up_to_a_full_fold(angle):
     # downwards, so that the normals point away from each other, is positive
     assert angle_of(hinge(angle)) == pytest.approx(angle, abs=1e-12)

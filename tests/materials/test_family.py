@@ -5,8 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import few
 from elastica import elastica
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from r2s._util.units import GRAVITY
@@ -14,7 +15,6 @@ from r2s.materials.fabric import Fabric, bending_length
 from r2s.materials.parameters import LOSSES, IsotropicSpace, OrthotropicSpace, Range
 from r2s.materials.presets import FIVE, pink_solid
 
-few = settings(max_examples=25, deadline=None)
 FAMILY = OrthotropicSpace.make(0.2)
 places = st.tuples(*[st.floats(0, 1)] * FAMILY.dim).map(np.array)
 there_and_back = jax.jit(lambda u: FAMILY.to_unit(FAMILY(u)))

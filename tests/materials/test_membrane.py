@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SHAPE, SIZE, flat, rotation, stored_energy
-from hypothesis import given, settings
+from conftest import SHAPE, SIZE, few, flat, rotation, stored_energy
+from hypothesis import given
 from hypothesis import strategies as st
 
 from r2s._util.units import isotropic_bending, isotropic_membrane
@@ -14,7 +14,6 @@ from r2s.materials.membrane import OrthotropicMembrane, SpringMembrane
 from r2s.mesh.mesh import Mesh, rectangle
 from r2s.mesh.strain_samples import on_samples
 
-few = settings(max_examples=25, deadline=None)
 CELL = SIZE / (SHAPE[0] - 1)  # side of the sheet's squares, [m]
 INDEX = np.arange(25).reshape(SHAPE)
 UNIFORM = {  # images of the sheet's axes in the plane

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import FIRST_ROW, SIZE, cloth, flat, roll
-from hypothesis import given, settings
+from conftest import FIRST_ROW, SIZE, cloth, few, flat, roll
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
@@ -16,7 +16,6 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import MembraneLaw, OrthotropicMembrane
 from r2s.materials.tables import HINGE_FACTOR, TableBending, TableMembrane
 
-few = settings(max_examples=25, deadline=None)
 STRETCHING = jnp.array(  # [N/m]; numbers of no fabric, which tell the rows apart
     [
         [100.0, 20.0, 50.0, 30.0],

@@ -4,13 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import flat
-from hypothesis import given, settings
+from conftest import few, flat
+from hypothesis import given
 from hypothesis import strategies as st
 
 from r2s.mesh.surface import nearest, sample
 
-few = settings(max_examples=25, deadline=None)
 TRIANGLE = jnp.array([[0, 1, 2]])
 coordinate = st.floats(-2, 2)
 triangles = st.tuples(*[st.tuples(coordinate, coordinate, coordinate)] * 3).filter(
