@@ -26,13 +26,7 @@ from r2s.solvers.explicit.grid import Slices, grid_for
 from r2s.solvers.explicit.layout import batch_last
 from r2s.solvers.explicit.sheet import Cells, ForceInputs, Gathers, Memory, cells_of, no_memory
 from r2s.solvers.explicit.stability import RELAXATION, check_step, stable_sheet_step
-from r2s.solvers.results import (
-    Result,
-    all_finite,
-    check_step_arguments,
-    first_failure,
-    no_failure,
-)
+from r2s.solvers.results import Result, all_finite, check_step_arguments, first_failure, no_failure
 
 Positions = Float[Array, "vertex 3"]
 OfSamples = Float[Array, "element sample 3"]
