@@ -3,5 +3,5 @@
 - `plan`: the tasks of a study. `recordings`, `mujoco`: what they estimate from and evaluate on.
 - `estimates`, `evaluations`, `ensembles`: the tasks; `tasks` and `engine` run them.
 - `results`: the results as one table, `results.csv`.
-- `comparisons`, `conclusions`: its analysis. `report`: tables, figures and motions on one page.
+- `conclusions`: what they say of the paper's. `report`: tables, figures and motions on one page.
 """

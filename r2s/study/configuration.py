@@ -41,13 +41,9 @@ def as_configuration(configuration: Configuration, baseline: str) -> Configurati
     """The configuration that stands for a baseline in tables; any other as it is."""
     if baseline in REFERENCES:
         return Configuration(REFERENCES[baseline], configuration.solver, "")
-    name = _named(configuration.approach)
-    names = {
-        "other_fabric": f"{name} (of another fabric)",
-        ON_CLOTH: f"{name} (found by MPM)",
-        "repeatability": "another trial",
-    }
-    return configuration._replace(approach=names.get(baseline, configuration.approach))
+    if baseline == ON_CLOTH:
+        return configuration._replace(approach=f"{_named(configuration.approach)} (found by MPM)")
+    return configuration
 
 
 def _named(approach: str) -> str:

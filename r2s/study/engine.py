@@ -51,7 +51,7 @@ SECONDS: dict[str, tuple[float, float]] = {
     "estimates pinn": (70.0, 60.0),
     "evaluations": (20.0, 13.0),
 }
-REFRESH, LINES = 1.0, 30.0  # [s] between updates on a terminal, and between lines in a file
+LINES = 30.0  # [s] between lines of progress
 # [s] that count as done at the expected pace, until finished tasks give a better estimate
 TRUST = 300.0
 
@@ -140,22 +140,21 @@ def in_words(seconds: float) -> str:
 
 @contextmanager
 def progress(seconds: float, count: int, processes: int) -> Iterator[list[float]]:
-    """Progress on stderr while tasks run: each second on a terminal, each half minute in a file.
+    """Progress on stderr while tasks run, a line each half minute.
 
     To the list that it yields the caller appends the expected time of each task that is done, of
     `seconds` in all, [CPU s].
     """
     done: list[float] = []
-    began, stop, is_terminal = time.monotonic(), threading.Event(), sys.stderr.isatty()
+    began, stop = time.monotonic(), threading.Event()
 
     def show() -> None:
-        while not stop.wait(REFRESH if is_terminal else LINES):
+        while not stop.wait(LINES):
             elapsed, made = time.monotonic() - began, sum(done)
             pace = (TRUST + elapsed) / (TRUST + made / processes)
             left = pace * (seconds - made) / processes
-            words = f"study of {count} cells: {100 * made / seconds:3.0f} %"
-            words += f", {in_words(elapsed)} elapsed, about {in_words(left)} left"
-            _say(f"\r{words:<79}" if is_terminal else words, "" if is_terminal else "\n")
+            words = f"{in_words(elapsed)} elapsed, about {in_words(left)} left"
+            _say(f"study of {count} cells: {100 * made / seconds:3.0f} %, {words}")
 
     thread = threading.Thread(target=show, daemon=True)
     thread.start()
@@ -166,8 +165,8 @@ def progress(seconds: float, count: int, processes: int) -> Iterator[list[float]
         thread.join()
 
 
-def _say(words: str, end: str = "\n") -> None:
-    print(words, end=end, file=sys.stderr, flush=True)
+def _say(words: str) -> None:
+    print(words, file=sys.stderr, flush=True)
 
 
 def one_thread(flags: str) -> str:

@@ -93,7 +93,7 @@ class EvaluationTask(Task):
         whose = f"{self.baseline}{self.repeat}_{self.solver}_{self.fabric}"
         if self.estimate is not None:
             whose = self.estimate.name
-        on = {"other_fabric": f"{self.fabric}_", ON_CLOTH: "cloth_"}.get(self.baseline, "")
+        on = "cloth_" if self.baseline == ON_CLOTH else ""
         return f"{whose}_on_{on}{self.scenario}_{self.recordings[0].name.split('_')[-1]}"
 
     @property

@@ -1,5 +1,6 @@
 """Plotly figures of a report: means, errors over time, and motions in 3-D with a time slider."""
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import cycle
@@ -10,7 +11,7 @@ import numpy as np
 import pandas as pd
 import plotly.express as px
 import plotly.graph_objects as go
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Float
 
 from r2s.mesh.mesh import rectangle
 from r2s.metrics.horizon import within
@@ -30,7 +31,7 @@ RUNAWAY = 2.0  # times the largest error of a reference: what is farther off is 
 DRAWN = 9  # vertices along a side that are drawn
 BUDGET = 7_000_000  # characters of all positions of a page
 CHARACTERS = 7  # of a coordinate in millimetres to a tenth, such as "-123.4,"
-FEWEST_POINTS, MOST_POINTS = 150, 800  # of a cloud, in a frame
+POINTS = 300  # of a cloud, in a frame
 NOW = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
 
 
@@ -38,9 +39,8 @@ class Motion(NamedTuple):
     """A recording and the simulations of its motion, at the frames that count.
 
     - `times`: of the frames, [s]. `clouds`: the points of each frame, [m].
-    - `faces`: the triangles of each configuration's sheet, by its label.
-    - `vertices`: of each configuration, [m]; not finite where it diverged. Of several runs
-      (estimates, or samples of the default) one.
+    - `vertices`: of each configuration, by its label, on a grid [m]; not finite where it diverged.
+      Of several runs (estimates, or samples of the default) the first.
     - `errors`: the distances of the points from the sheets of all runs, [m].
     - `floor`: the accuracy of the recording, [m]. `horizon`: the time up to which it discriminates
       between fabrics, [s]. None: not known.
@@ -51,8 +51,7 @@ class Motion(NamedTuple):
     recording: str
     times: Float[np.ndarray, " frame"]
     clouds: Sequence[Float[np.ndarray, "_ 3"]]
-    faces: Mapping[str, Integer[np.ndarray, "face 3"]]
-    vertices: Mapping[str, Float[np.ndarray, "frame vertex 3"]]
+    vertices: Mapping[str, Float[np.ndarray, "frame row column 3"]]
     errors: Mapping[str, Float[np.ndarray, "run frame"]]
     floor: Float[np.ndarray, " frame"] | None = None
     horizon: float | None = None
@@ -77,14 +76,11 @@ class Motion(NamedTuple):
 
 def judged_recordings(tasks: Sequence[EvaluationTask], folder: Path) -> list[Motion]:
     """The first recording of each fabric and motion with its finished simulations by all
-    configurations, references and defaults, in the order of `MOTIONS`.
-
-    Of several estimates, or samples, the sheet is that of the one with the median error within the
-    horizon. Estimates come first, the default last.
-    """
+    configurations, references and defaults, in the order of `MOTIONS`. Estimates come first, the
+    default last."""
     groups: dict[Source, dict[str, list[EvaluationTask]]] = defaultdict(lambda: defaultdict(list))
     for task in tasks:
-        if task.baseline != "other_fabric" and task.is_made(folder):
+        if task.is_made(folder):
             label = as_configuration(task.configuration, task.baseline).label
             groups[task.recordings[0]][label].append(task)
     first = {(source.fabric, source.scenario): source for source in reversed(groups)}
@@ -100,42 +96,25 @@ def _motion(
     recording = read(source, folder)
     first, last = recording.info.frames_used
     rank = {"": 0, ON_CLOTH: 0, "true": 1, "middle": 2, "default": 3}
-    errors, vertices, faces = {}, {}, {}
+    errors, vertices = {}, {}
     for label, tasks in sorted(group.items(), key=lambda item: rank[item[1][0].baseline]):
         runs = [read_predictions(task, folder)[source.name] for task in tasks]
         errors[label] = np.stack([run.distances for run in runs])
-        x = runs[median_run(errors[label], judged)].x[first : last + 1]
-        vertices[label], shape = thinned(x, tasks[0].shape)
-        faces[label] = np.asarray(rectangle(recording.info.sheet.size, shape).faces)
+        shape = tasks[0].shape
+        every = max((shape[0] - 1) // (DRAWN - 1), 1)
+        x = runs[0].x[first : last + 1].reshape(-1, *shape, 3)
+        vertices[label] = x[:, ::every, ::every]
     return Motion(
         fabric=source.fabric,
         evaluated_on=source.scenario,
         recording=source.name,
         times=np.asarray(recording.times)[first : last + 1],
         clouds=tuple(cloud(recording, frame) for frame in range(first, last + 1)),
-        faces=faces,
         vertices=vertices,
         errors=errors,
         floor=None if judged is None else judged.floor,
         horizon=None if judged is None else judged.horizon,
     )
-
-
-def median_run(runs: Float[np.ndarray, "run frame"], judged: Judged | None) -> int:
-    """The run with the median mean error within the horizon; runs that diverged are last."""
-    if judged is not None and judged.inside.any():
-        runs = runs[:, judged.inside]
-    means = np.where(np.isfinite(runs), runs, np.inf).mean(axis=1)
-    return int(np.argsort(means, kind="stable")[(len(means) - 1) // 2])
-
-
-def thinned(
-    x: Float[np.ndarray, "frame vertex 3"], shape: Sequence[int]
-) -> tuple[Float[np.ndarray, "frame _ 3"], tuple[int, int]]:
-    """Every n-th vertex of a square sheet so that `DRAWN` a side are left, and their shape."""
-    stride = max((shape[0] - 1) // (DRAWN - 1), 1)
-    grid = x.reshape(len(x), *shape, 3)[:, ::stride, ::stride]
-    return grid.reshape(len(x), -1, 3), (grid.shape[1], grid.shape[2])
 
 
 def colours_of(labels: Iterable[str]) -> dict[str, str]:
@@ -152,21 +131,15 @@ def colours_of(labels: Iterable[str]) -> dict[str, str]:
 def interval_chart(
     means: pd.DataFrame, colours: Mapping[str, str], title: str, marks: Mapping[float, str]
 ) -> go.Figure:
-    """Means with their intervals, a panel a motion, a line a configuration.
+    """Means with their intervals, a panel a motion, a line a configuration; no mean is drawn of
+    which a run diverged.
 
     `means`: from `r2s.study.results.means`. `marks`: values with a vertical line.
     """
     table = means.reset_index()
     table["configuration"] = table.configuration.astype(str)
-    known = np.isfinite(table["mean"])
-    low = min([*marks, *table["mean"][known], 0.0])
-    diverged = table.diverged.map("{:.0f}".format) + " of " + table.runs.map("{:.0f}".format)
-    table = table.assign(
-        above=table.high - table["mean"],
-        below=table["mean"] - table.low,
-        note=(diverged + " runs diverged").where(~known, ""),
-    )
-    table["mean"] = table["mean"].where(known, low)
+    table["mean"] = table["mean"].where(np.isfinite(table["mean"]))  # or a run diverged
+    table = table.assign(above=table.high - table["mean"], below=table["mean"] - table.low)
     labels = list(dict.fromkeys(table.configuration))
     figure = px.scatter(
         table,
@@ -175,7 +148,6 @@ def interval_chart(
         facet_col="evaluated_on",
         error_x="above",
         error_x_minus="below",
-        text="note",
         color="configuration",
         color_discrete_map=dict(colours),
         category_orders={"configuration": labels},
@@ -184,7 +156,7 @@ def interval_chart(
     )
     for value, words in marks.items():
         figure.add_vline(value, line_dash="dot", annotation_text=words)
-    return figure.update_traces(textposition="middle right").update_layout(showlegend=False)
+    return figure.update_layout(showlegend=False)
 
 
 def error_chart(motion: Motion, colours: Mapping[str, str]) -> go.Figure:
@@ -222,19 +194,19 @@ def error_chart(motion: Motion, colours: Mapping[str, str]) -> go.Figure:
 
 
 def motion_figures(motions: Sequence[Motion], colours: Mapping[str, str]) -> list[go.Figure]:
-    """A 3-D figure with a time slider for each motion; together they have at most `BUDGET`.
-
-    Of long or fine recordings every n-th frame is drawn, and of clouds as many points as fit. The
-    slider begins at the last frame before the horizon.
-    """
+    """A 3-D figure with a time slider for each motion, with as many frames as `BUDGET` allows; the
+    slider begins at the last frame before the horizon."""
     return [_figure(motion, colours, BUDGET // len(motions)) for motion in motions]
 
 
 def _figure(motion: Motion, colours: Mapping[str, str], budget: int) -> go.Figure:
-    frames, count = _affordable(motion, budget)
+    positions = POINTS + sum(x[0].size // 3 for x in motion.vertices.values())
+    most = max(budget // (3 * CHARACTERS * positions) - 1, 1)  # one is drawn at first
+    count = len(motion.times)
+    frames = list(range(0, count, math.ceil(count / most)))
     generator = np.random.default_rng(0)
     finite = [motion.clouds[i][np.isfinite(motion.clouds[i]).all(axis=1)] for i in frames]
-    clouds = [generator.permutation(points)[:count] for points in finite]
+    clouds = [generator.permutation(points)[:POINTS] for points in finite]
     data = [
         [
             {"type": "scatter3d", **_positions(cloud)},
@@ -267,21 +239,10 @@ def _figure(motion: Motion, colours: Mapping[str, str], budget: int) -> go.Figur
     )
 
 
-def _affordable(motion: Motion, budget: int) -> tuple[np.ndarray, int]:
-    """Which frames, and how many points of each, fit into a budget of characters."""
-    vertices = sum(x.shape[1] for x in motion.vertices.values())
-    count = len(motion.times)
-    for stride in range(1, count + 1):
-        frames = np.arange(0, count, stride)
-        room = budget / CHARACTERS / 3 / (len(frames) + 1) - vertices
-        if room >= FEWEST_POINTS:
-            return frames, int(min(room, MOST_POINTS))
-    return np.arange(1), FEWEST_POINTS
-
-
 def _look(motion: Motion, label: str, colour: str) -> dict:
     """Of a sheet; the first configuration and the true fabric are visible, others on a click."""
-    corners = zip("ijk", np.asarray(motion.faces[label], np.uint16).T, strict=True)
+    faces = rectangle((1.0, 1.0), motion.vertices[label].shape[1:3]).faces
+    corners = zip("ijk", np.asarray(faces, np.uint16).T, strict=True)
     is_shown = label == next(iter(motion.vertices)) or label.startswith(REFERENCES["true"])
     legend = {"name": label, "showlegend": True, "visible": True if is_shown else "legendonly"}
     return dict(corners) | legend | {"color": colour, "flatshading": True, "hoverinfo": "name"}
@@ -289,9 +250,9 @@ def _look(motion: Motion, label: str, colour: str) -> dict:
 
 def _vertices(x: np.ndarray) -> dict:
     """The last vertices of a motion; where it diverged, those before it, not visible."""
-    is_known = np.all(np.isfinite(x), axis=(1, 2))
+    is_known = np.all(np.isfinite(x), axis=(1, 2, 3))
     last = x[is_known][-1] if is_known.any() else np.zeros_like(x[0])
-    return {**_positions(last), "opacity": 0.75 if is_known[-1] else 0.0}
+    return {**_positions(last.reshape(-1, 3)), "opacity": 0.75 if is_known[-1] else 0.0}
 
 
 def _positions(points: np.ndarray) -> dict:

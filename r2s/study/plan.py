@@ -214,9 +214,9 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationTask]:
     `density`: areal density to assume, [kg/m^2]. `plan`: gives budgets and configurations.
 
     Each recording is a repeat. An estimate is evaluated on those `MOTIONS` of the same fabric and
-    trial (of all trials where that trial has none) that it has not seen, and so is the estimate of
-    another fabric. Raises what `find_recordings` raises, and `ValueError` for a density that is
-    not positive, and without recordings to estimate from or to evaluate on.
+    trial (of all trials where that trial has none) that it has not seen. Raises what
+    `find_recordings` raises, and `ValueError` for a density that is not positive, and without
+    recordings to estimate from or to evaluate on.
     """
     default_space("cloth", density)  # raises for a density that is not positive
     # clouds of real cameras need the whole search, and there are few frames to evaluate on
@@ -233,28 +233,16 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationTask]:
         )
     evaluations: list[EvaluationTask] = []
     for configuration in plan.configurations:
-        estimates = [
-            _estimate(configuration, group, density, plan, repeat)
-            for repeat, group in enumerate(_together(sources, configuration.scenarios))
-        ]
-        for index, estimate in enumerate(estimates):
-            same = [r for r in unseen if r.fabric == estimate.fabric]
-            trial = getattr(estimate.sources[0], "trial", "")
+        for repeat, group in enumerate(_together(sources, configuration.scenarios)):
+            fabric, trial = group[0].fabric, group[0].trial
+            same = [r for r in unseen if r.fabric == fabric]
             same = [r for r in same if r.trial == trial] or same
-            by_scenario: dict[str, list[Source]] = defaultdict(list)
-            for recording in same:
-                if recording not in estimate.sources:
-                    by_scenario[recording.scenario].append(recording)
-            judged = [tuple(group) for group in by_scenario.values()]
-            evaluations += _evaluations([estimate], estimate.fabric, density, judged, plan)
-            following = [*estimates[index + 1 :], *estimates[:index]]
-            other = next((e for e in following if e.fabric != estimate.fabric), None)
-            if other is not None:
-                whose = other, configuration.solver, density, estimate.fabric
-                evaluations += [
-                    EvaluationTask(*whose, group, "other_fabric", every=plan.every)
-                    for group in judged
-                ]
+            judged = [
+                tuple(r for r in same if r.scenario == motion and r not in group)
+                for motion in MOTIONS
+            ]
+            estimate = _estimate(configuration, group, density, plan, repeat)
+            evaluations += _evaluations([estimate], fabric, density, judged, plan)
     return list(dict.fromkeys(evaluations))  # configurations share the default fabric
 
 

@@ -1,13 +1,14 @@
 """The report of a study: `report.html`, one file that works without a network, and its tables.
 
-`report.html.j2` is the template of the page.
+`report.html.j2` is the template of the page, and has its words.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -16,14 +17,15 @@ import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
 from r2s._util.files import write_text
+from r2s.estimation.default_spaces import FROM, fixed, with_law
+from r2s.estimation.method import default_space
 from r2s.metrics.prediction_error import METRICS, UNITS
 from r2s.metrics.statistics import LEVEL
-from r2s.study import comparisons, conclusions
+from r2s.study import conclusions
 from r2s.study import results as frame
-from r2s.study import tables as text_tables
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS
-from r2s.study.ensembles import BEYOND, SURFACE, ensembles
-from r2s.study.estimates import ESTIMATE
+from r2s.study.ensembles import BEYOND, SURFACE, ensembles, judged_motions
+from r2s.study.estimates import ESTIMATE, EstimateTask, method_of
 from r2s.study.evaluations import EvaluationTask
 from r2s.study.figures import (
     Motion,
@@ -34,8 +36,8 @@ from r2s.study.figures import (
     motion_figures,
 )
 from r2s.study.plan import Plan
-from r2s.study.tables import MISSING, mean_table, mean_text, significant
-from r2s.study.tasks import Task, provenance, result_files
+from r2s.study.recordings import SimulatedRecording, read
+from r2s.study.tasks import Task, provenance, read_metadata, result_files, with_dependencies
 
 # The first that is there compares configurations: within the horizon, where one is known. The
 # parts of a sheet that cameras did not see do not count. Hausdorff distances are those of outliers.
@@ -44,26 +46,10 @@ DISTANCES = tuple(dict.fromkeys([*JUDGED_BY[:-1], *(m for m in METRICS if m not 
 MOST_MOTIONS = 15  # that are drawn
 PRINTED = ("skill", "findings")  # the other tables are in files
 VERSIONS = ("r2s", "jax", "jaxlib", "equinox", "numpy", "scipy", "pandas", "statsmodels", "plotly")
-INTERVAL = f"means over fabrics, with {LEVEL:.0%} intervals for fabrics like these"
-QUESTION = (
-    "Which approach, on which solver and from which recording, estimates a fabric that moves as "
-    "the real one does?"
-)
+MISSING = "-"
+LEAST = 2e-3  # [m]: the effect of mesh and step in a converged motion, mean up to the horizon
 
-Tables = dict[str, tuple[str, pd.DataFrame]]  # by name, with a caption
-
-
-class Section(NamedTuple):
-    """A part of the report: paragraphs, tables by name with a caption, figures by title.
-
-    `folded`: figures are drawn when a reader opens them, as browsers have few 3-D contexts.
-    """
-
-    heading: str
-    words: Sequence[str] = ()
-    tables: Mapping[str, tuple[str, pd.DataFrame]] = {}
-    figures: Mapping[str, go.Figure] = {}
-    folded: bool = False
+Tables = dict[str, pd.DataFrame]
 
 
 def publish_study(
@@ -80,9 +66,9 @@ def publish_study(
     - `source`: where the recordings are from, in words.
     - `paper`: a folder with the tables of the paper.
     """
-    results, estimates = frame.collect(tasks, out), frame.estimates_made(tasks, out)
-    frame.write_results(out / "results.csv", results)
-    for task in estimates:
+    results = frame.collect(tasks, out)
+    write_text(out / "results.csv", results.to_csv(index=False, lineterminator="\n"))
+    for task in frame.estimates_made(tasks, out):
         with result_files(task, out) as files:
             if (files / ESTIMATE).exists():
                 (out / "estimates").mkdir(exist_ok=True)
@@ -95,11 +81,10 @@ def publish_study(
         out,
         results,
         judged_recordings(tasks, out),
-        frame.parameters(tasks, out),
+        making(tasks, out),
         [(f"{task.kind} {task.name}", reason) for task, reason in failed.items()],
         settings,
         paper,
-        text_tables.tables_of_the_making(tasks, estimates, out),
     )
     for name in PRINTED:
         if name in tables:
@@ -111,70 +96,75 @@ def publish(
     out: Path,
     results: pd.DataFrame,
     motions: Sequence[Motion] = (),
-    parameters: pd.DataFrame | None = None,
+    making: Mapping[str, pd.DataFrame] | None = None,
     missing: Sequence[tuple[str, str]] = (),
     settings: Mapping[str, str] | None = None,
     paper_folder: Path | None = None,
-    making: Tables | None = None,
-) -> dict[str, pd.DataFrame]:
+) -> Tables:
     """Write `report.html` and `tables/` into `out`; returns the tables by name.
 
     - `results`: see `r2s.study.results`. `motions`: recordings to draw.
-    - `parameters`: the estimates (`r2s.study.results.parameters`).
+    - `making`: tables of what was estimated, and how (`making`).
     - `missing`: tasks without a result, and why. `settings`: those of the study.
     - `paper_folder`: the paper's tables, see `r2s.study.conclusions`.
-    - `making`: tables of how the study was made.
 
     Raises what `read_paper` raises, and OSError that names what cannot be written.
     """
     papers = conclusions.read_paper(paper_folder)
     every = frame.labelled(frame.without_undefined(results))
-    fabrics = frame.fabrics_in_common(every)
-    shared = every[every.fabric.isin(fabrics)]
-    metric = next((name for name in JUDGED_BY if name in set(shared.metric)), SURFACE)
+    shared = every[every.fabric.isin(frame.fabrics_in_common(every))]
+    metric = next((name for name in JUDGED_BY if (shared.metric == name).any()), SURFACE)
     skip = frame.undecided(shared, SURFACE) if metric == SURFACE else []
     decided = shared[(shared.metric == metric) & ~shared.recording.isin(skip)]
-    judged = conclusions.findings(decided, papers)
-    drawn = [label for motion in motions for label in motion.vertices]
-    colours = colours_of([*every.configuration.cat.categories, *drawn])
-    known = frame.with_floor(shared, SURFACE)
-    with_skill = known[known.skill.notna()]
-    column, part = ("skill", with_skill) if len(with_skill) else ("value", decided)
-    means = frame.means(part, column)
-    lines = [
-        *(settings or {}).items(),
-        *((f"version of {name}", version(name)) for name in VERSIONS),
-    ]
-    opening = [_done(decided, len(fabrics), len(missing)), _best(means, part, column)]
-    opening += [_significance(judged, len(fabrics))]
-    sections = [
-        Section(QUESTION, opening, figures=_chart(means, column, metric, colours)),
-        _skill(shared, every, known),
-        _findings(judged, metric, skip),
-        *_motions(motions, colours),
-        Section("Ranks", (), _ranks(decided, metric)),
-        Section("Parameters", (), _parameters(parameters)),
-        Section("How it was made", (), making or {}),
-        Section("All distances", (), _distances(shared, papers)),
-        _missing(every, missing),
-        Section(
-            "Settings", (), {"settings": ("", pd.DataFrame(lines, columns=["setting", "value"]))}
+    judged = conclusions.findings(decided)
+    versions = {f"version of {name}": version(name) for name in VERSIONS}
+    tables = {
+        **_skill(shared, every),
+        "findings": judged,
+        **(making or {}),
+        **_distances(shared, papers),
+        "missing": pd.DataFrame(missing, columns=["cell", "reason"]),
+        "settings": pd.DataFrame(
+            [*{**(settings or {}), **versions}.items()], columns=["setting", "value"]
         ),
-    ]
-    sections = [section for section in sections if section.words or section.tables]
-    tables = {name: table for section in sections for name, (_, table) in section.tables.items()}
+    }
+    tables = {name: table for name, table in tables.items() if len(table)}
+    shown = motions[:MOST_MOTIONS]
+    drawn = [label for motion in shown for label in motion.vertices]
+    colours = colours_of([*every.configuration.cat.categories, *drawn])
+    titles = [motion.title for motion in shown]
+    page = {
+        "tables": tables,
+        "facts": _facts(decided, shared),
+        "chart": _chart(shared, decided, metric, colours),
+        "errors": dict(zip(titles, (error_chart(m, colours) for m in shown), strict=True)),
+        "sheets": dict(zip(titles, motion_figures(shown, colours), strict=True)),
+        "hidden": len(motions) - len(shown),
+        "answers": conclusions.answers(judged),
+        "metric": metric,
+        "skip": skip,
+        "failed": len(missing),
+        "left_out": sorted(set(every.fabric) - set(shared.fabric)),
+        "absent": [c.label for c in PAPER_CONFIGURATIONS if c not in frame.configurations(every)],
+        "level": f"{LEVEL:.0%}",
+        "least": f"{1e3 * LEAST:g} mm",
+        "cited": conclusions.CITED if len(papers) else "",
+    }
     (out / "tables").mkdir(parents=True, exist_ok=True)
     for old in (out / "tables").glob("*.csv"):
         old.unlink()
     for name, table in tables.items():
         text = table.to_csv(index=False, lineterminator="\n")
         write_text(out / "tables" / f"{name}.csv", text)
+    write_text(out / "report.html", _html(page))
+    return tables
+
+
+def _html(page: Mapping[str, Any]) -> str:
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
     environment.filters |= {"table": _html_table, "figure": _json_figure}
-    template = environment.get_template("report.html.j2")
-    write_text(out / "report.html", template.render(sections=sections, plotly=get_plotlyjs()))
-    return tables
+    return environment.get_template("report.html.j2").render(page, plotly=get_plotlyjs())
 
 
 def _html_table(table: pd.DataFrame) -> str:
@@ -188,188 +178,238 @@ def _json_figure(figure: go.Figure) -> str:
     return text.replace("<", "\\u003c")  # "<" would end the element that holds it
 
 
+def _means(shared: pd.DataFrame, decided: pd.DataFrame) -> tuple[pd.DataFrame, bool]:
+    """The mean skills, or where none is known the mean distances; and whether they are skills."""
+    known = frame.with_floor(shared, SURFACE)
+    known = known[known.skill.notna()]
+    return (frame.means(known, "skill"), True) if len(known) else (frame.means(decided), False)
+
+
 def _chart(
-    means: pd.DataFrame, column: str, metric: str, colours: Mapping[str, str]
-) -> dict[str, go.Figure]:
-    """The mean skills, or where none is known the mean distances, by the title of the chart."""
+    shared: pd.DataFrame, decided: pd.DataFrame, metric: str, colours: Mapping[str, str]
+) -> go.Figure | None:
+    means, is_skill = _means(shared, decided)
     if means.empty:
-        return {}
-    what, unit, marks = f"Mean {metric}", f"{metric} [m]", {}
-    if column == "skill":
-        what, unit, marks = "Skill", "skill [-]", {0.0: "default", 1.0: "floor"}
-    title = f"{what} in motions that no estimate has seen, with {LEVEL:.0%} intervals"
-    return {title: interval_chart(means, colours, unit, marks)}
+        return None
+    if is_skill:
+        return interval_chart(means, colours, "skill [-]", {0.0: "default", 1.0: "floor"})
+    return interval_chart(means, colours, f"{metric} [m]", {})
 
 
-def _done(decided: pd.DataFrame, fabrics: int, missing: int) -> str:
-    own = decided[decided.baseline == ""]
-    of_fabrics = f"{fabrics} {'fabric' if fabrics == 1 else 'fabrics'}"
-    are_missing = "cell of the study is" if missing == 1 else "cells of the study are"
-    return (
-        f"{len(frame.configurations(decided))} configurations (approach, solver, source) estimated "
-        f"{of_fabrics} and were evaluated on {decided.recording.nunique()} recordings of "
-        f"{', '.join(frame.motions(decided)) or 'no motion'}, which no estimate has seen. Of "
-        f"{len(own)} predictions {int(own.diverged.sum())} diverged; {missing} {are_missing} "
-        "missing."
-    )
-
-
-def _best(means: pd.DataFrame, part: pd.DataFrame, column: str) -> str:
-    """The configuration with the best mean by motion, of those of which no run diverged."""
-    labels = set(part[part.baseline == ""].configuration)
+def _facts(decided: pd.DataFrame, shared: pd.DataFrame) -> dict[str, Any]:
+    """What was done, and by motion the configuration with the best mean of those of which no run
+    diverged."""
+    own = decided[decided.baseline == frame.ESTIMATE]
+    means, is_skill = _means(shared, decided)
+    table = means.reset_index()
+    table = table[np.isfinite(table["mean"]) & table.configuration.isin(own.configuration)]
     best = []
-    for motion in frame.motions(part):
-        table = means.xs(motion, level="evaluated_on")
-        table = table[np.isfinite(table["mean"]) & table.index.isin(labels)]
-        if len(table):
-            label = table["mean"].idxmax() if column == "skill" else table["mean"].idxmin()
-            write = "{:.2f}".format if column == "skill" else "{:.3g}".format
-            best.append(f"{label} in {motion} ({mean_text(table.loc[label], write)})")
-    if not best:
-        return "No configuration has a result that could be compared."
-    what = "The highest mean skill" if column == "skill" else "The smallest mean distance"
-    return f"{what} has {'; '.join(best)}."
-
-
-def _significance(judged: pd.DataFrame, fabrics: int) -> str:
-    if fabrics < 2:
-        return (
-            "One fabric decides nothing between approaches: differences between them may be those "
-            "of this fabric, and there are no intervals and no tests."
-        )
-    answers = list(comparisons.answers(judged).values())
-    return (
-        f"Of the paper's {len(answers)} conclusions {answers.count(comparisons.HOLDS)} hold "
-        f"and {answers.count(comparisons.HOLDS_NOT)} do not; "
-        f"{answers.count(comparisons.UNKNOWN)} cannot be decided from {fabrics} fabrics."
-    )
-
-
-def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> Section:
-    """Error, floor and skill by configuration; and features of the motion beyond the horizon."""
-    if known.empty:
-        return Section("Skill", ("No recording has a floor and a horizon: no skill is known.",))
-    words = [
-        "Skill is (default - error) / (default - floor): 1 where the error is as small as the "
-        "accuracy of the truth, 0 for the mean of random fabrics of the same weight (the default). "
-        "It is not known where the default is not clearly above the floor. A run that diverged has "
-        "an infinite error and a skill of minus infinity.",
-        "The true fabric has the truth's stiffness at small strain. The prior mean is the best "
-        "guess from the weight alone: an approach that is not better has learned nothing.",
-    ]
-    if left_out := sorted(set(every.fabric) - set(shared.fabric)):
-        words.append(
-            f"Not every configuration has an estimate of {', '.join(left_out)}: means do not "
-            "include it, the table by fabric does."
-        )
-    table = text_tables.skill_table(frame.means(known), frame.skills(known))
-    tables: Tables = {
-        "skill": (f"Error up to the horizon, floor and skill: {INTERVAL}", table),
-        "learned": (
-            "Error of the prior mean over that of each configuration",
-            comparisons.learned(known, SURFACE),
-        ),
-        "skill_by_fabric": ("Skill by fabric", _by_fabric(frame.with_floor(every, SURFACE))),
-    }
-    beyond = shared[shared.metric.str.startswith(BEYOND)]
-    for motion in frame.motions(beyond):
-        table = mean_table(beyond[beyond.evaluated_on == motion], "metric")
-        text = f"{motion}, differences to the recording beyond the horizon: {INTERVAL}"
-        tables[f"beyond_{motion}"] = text, table
-    return Section("Skill", words, {name: t for name, t in tables.items() if len(t[1])})
-
-
-def _by_fabric(known: pd.DataFrame) -> pd.DataFrame:
-    keys = ["fabric", "evaluated_on", "configuration"]
-    means = known.groupby(keys, observed=True)[["value", "floor", "skill"]].mean()
-    means["diverged"] = known.groupby(keys, observed=True).diverged.sum()
-    millimetres = {"error [mm]": 1e3 * means.value, "floor [mm]": 1e3 * means.floor}
-    return means.assign(**millimetres).drop(columns=["value", "floor"]).reset_index()
-
-
-def _findings(judged: pd.DataFrame, metric: str, skip: Sequence[str]) -> Section:
-    words = [
-        f"Each conclusion of the paper (Ru et al. 2025) is tested on {metric}, with one number for "
-        "each fabric. Ratios are above 1 where the conclusion is right; p is Student's t test with "
-        "Holm's correction. Runs that diverged have no ratio, and nothing is concluded in favour "
-        "of a side that has any.",
-        *(f"{answer.capitalize()}: {x}" for x, answer in comparisons.answers(judged).items()),
-    ]
-    if skip:
-        words.append(
-            f"{len(skip)} recordings do not discriminate between fabrics and count neither here "
-            f"nor in ranks: {', '.join(skip)}."
-        )
-    return Section("The paper's conclusions", words, {"findings": ("Comparisons", judged)})
-
-
-def _motions(motions: Sequence[Motion], colours: Mapping[str, str]) -> list[Section]:
-    shown = motions[:MOST_MOTIONS]
-    if not shown:
-        return []
-    titles = [motion.title for motion in shown]
-    errors = {motion.title: error_chart(motion, colours) for motion in shown}
-    words = (
-        "Mean distance of the recorded points from each simulated surface. Differences within the "
-        "shaded floor are not significant; beyond the horizon an error says nothing about a "
-        "fabric. Lines are dashed for material points, and end where a run diverged."
-    )
-    turn = (
-        "Recorded points and simulated sheets: open a motion, move the slider, turn the view; a "
-        "click in the legend shows or hides a sheet."
-    )
-    if len(motions) > len(shown):
-        turn += f" {len(motions) - len(shown)} more recordings are not shown."
-    figures = dict(zip(titles, motion_figures(shown, colours), strict=True))
-    return [
-        Section("Error over time", (words,), figures=errors),
-        Section("Motions", (turn,), figures=figures, folded=True),
-    ]
-
-
-def _ranks(decided: pd.DataFrame, metric: str) -> Tables:
-    parts = {m: decided[decided.evaluated_on == m] for m in frame.motions(decided)}
-    parts |= {"all motions": decided} if len(parts) > 1 else {}
-    ranked = {m: r for m, part in parts.items() if (r := comparisons.rank(part)) is not None}
-    if not ranked:
-        return {}
-    tests = "; ".join(f"{motion}: {ranks.words}" for motion, ranks in ranked.items())
-    table = pd.concat({motion: ranks.table for motion, ranks in ranked.items()}, names=["motion"])
-    text = f"Mean ranks by {metric} with {LEVEL:.0%} intervals, and how often first. {tests}"
-    return {"ranks": (text, table.reset_index())}
-
-
-def _parameters(parameters: pd.DataFrame | None) -> Tables:
-    groups = () if parameters is None else parameters.groupby("solver")
-    text = f"with {LEVEL:.0%} intervals, and the truth where it is known"
+    for motion, rows in table.groupby("evaluated_on", sort=False):
+        row = rows.loc[rows["mean"].idxmax() if is_skill else rows["mean"].idxmin()]
+        number = mean_text(row, "{:.2f}".format if is_skill else "{:.3g}".format)
+        best.append(f"{row.configuration} in {motion} ({number})")
     return {
-        f"parameters_{solver}": (f"Estimates on {solver}, {text}", part.drop(columns="solver"))
-        for solver, part in groups
+        "is_skill": is_skill,
+        "best": best,
+        "configurations": len(frame.configurations(decided)),
+        "fabrics": shared.fabric.nunique(),
+        "recordings": decided.recording.nunique(),
+        "motions": frame.motions(decided),
+        "predictions": len(own),
+        "diverged": int(own.diverged.sum()),
+    }
+
+
+def _skill(shared: pd.DataFrame, every: pd.DataFrame) -> Tables:
+    """Error, floor and skill by configuration; and features of the motion beyond the horizon."""
+    known = frame.with_floor(shared, SURFACE)
+    if known.empty:
+        return {}
+    keys = ["fabric", "evaluated_on", "configuration"]
+    of_fabric = frame.with_floor(every, SURFACE).groupby(keys, observed=True)
+    means = of_fabric[["skill", "value", "floor"]].mean()
+    means[["value", "floor"]] *= 1e3
+    means["diverged"] = of_fabric.diverged.sum()
+    beyond = shared[shared.metric.str.startswith(BEYOND)]
+    return {
+        "skill": skill_table(frame.means(known), frame.skills(known)),
+        "learned": conclusions.learned(known, SURFACE),
+        "skill_by_fabric": means.rename(
+            columns={"value": "error [mm]", "floor": "floor [mm]"}
+        ).reset_index(),
+        **{
+            f"beyond_{motion}": mean_table(beyond[beyond.evaluated_on == motion], "metric")
+            for motion in frame.motions(beyond)
+        },
     }
 
 
 def _distances(shared: pd.DataFrame, papers: pd.DataFrame) -> Tables:
-    tables: Tables = {}
-    for metric in DISTANCES:
-        own = shared[(shared.metric == metric) & shared.evaluated_on.isin(MOTIONS)]
-        if len(own):
-            tables[metric] = f"{metric}: {INTERVAL}", mean_table(own, "evaluated_on")
-    one_by_one = text_tables.recording_table(shared, "chamfer_real_to_sim")
-    if len(one_by_one):
-        tables["recordings"] = "chamfer_real_to_sim [mm] of every recording", one_by_one
+    own = shared[shared.evaluated_on.isin(MOTIONS)]
+    known = [metric for metric in DISTANCES if (own.metric == metric).any()]
+    tables = {m: mean_table(own[own.metric == m], "evaluated_on") for m in known}
     for motion in MOTIONS:
         table = conclusions.beside_paper(shared, papers, motion)
         if len(table.columns) > 1:
-            cited = f"; paper: {conclusions.CITED}" if len(papers) else ""
-            text = f"Chamfer distance on {motion} in the units of the paper [-]{cited}"
-            tables[f"{motion}_{conclusions.CHAMFER}"] = text, table
+            tables[f"{motion}_{conclusions.CHAMFER}"] = table
     return tables
 
 
-def _missing(every: pd.DataFrame, missing: Sequence[tuple[str, str]]) -> Section:
-    known = frame.configurations(every)
-    absent = [c.label for c in PAPER_CONFIGURATIONS if c not in known]
-    words = f"Configurations of the paper that have no result here: {', '.join(absent)}."
-    table = pd.DataFrame(list(missing), columns=["cell", "reason"])
-    tables = {"missing": ("Cells without a result, and why", table)} if missing else {}
-    return Section("What is missing", (words,) if absent else (), tables)
+def significant(value: float) -> str:
+    """A number with three significant digits, without an exponent from 1e-4 up to 1e6."""
+    rounded = float(f"{value:.3g}")
+    if 1e3 <= abs(rounded) < 1e6:  # "g" would write 1.23e+03
+        return f"{rounded:.0f}"
+    return f"{rounded:#.3g}".removesuffix(".")
+
+
+def millimetres(metres: float) -> str:
+    """A length [m] in millimetres to a tenth; below one to a hundredth."""
+    return f"{1e3 * metres:.1f}" if abs(metres) >= 0.995e-3 else f"{1e3 * metres:.2f}"
+
+
+def mean_text(row: pd.Series, write: Callable[[float], str]) -> str:
+    """A mean with its interval, from a row of `means`; where runs diverged how many, and the
+    median."""
+    if row.diverged:
+        median = f", median {write(row['median'])}" if np.isfinite(row["median"]) else ""
+        return f"{row.diverged:.0f} of {row.runs:.0f} diverged{median}"
+    ends = f" [{write(row.low)}, {write(row.high)}]" if row.low < row.high else ""
+    return write(row["mean"]) + ends
+
+
+def skill_table(errors: pd.DataFrame, skills: pd.DataFrame) -> pd.DataFrame:
+    """Error, floor and skill by motion, a line a configuration; from `means` and `skills` of
+    `r2s.study.results`."""
+    columns: dict[str, dict[str, str]] = {}
+    for (label, motion), row in skills.iterrows():
+        skill = mean_text(row, "{:.2f}".format) if row.runs > 0 else "not known"
+        if str(label).startswith("default "):
+            skill = "0"
+        elif 0 < row.known < row.judged:
+            skill += f", known in {row.known:.0f} of {row.judged:.0f}"
+        texts = {
+            "error [mm]": mean_text(errors.loc[(label, motion)], millimetres),
+            "floor [mm]": f"{1e3 * row.floor:.2f}",
+            "skill": skill,
+        }
+        for name, text in texts.items():
+            columns.setdefault(f"{motion}: {name}", {})[str(label)] = text
+    order = dict.fromkeys(map(str, skills.index.get_level_values("configuration")))
+    return _by_configuration(pd.DataFrame(columns), order)
+
+
+def mean_table(results: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Means with intervals, a line a configuration, a column for each value of `column`
+    ("evaluated_on" or "metric"); metres are in millimetres."""
+    columns = {}
+    names = frame.motions(results) if column == "evaluated_on" else dict.fromkeys(results.metric)
+    for name in names:
+        part = results[results[column] == name].assign(evaluated_on=name)
+        unit = part.unit.iloc[0]
+        write = millimetres if unit == "m" else significant
+        columns[f"{name} [{'mm' if unit == 'm' else unit}]"] = {
+            str(label): mean_text(row, write) for (label, _), row in frame.means(part).iterrows()
+        }
+    return _by_configuration(pd.DataFrame(columns), results.configuration.cat.categories)
+
+
+def _by_configuration(table: pd.DataFrame, order: Iterable[str]) -> pd.DataFrame:
+    table = table.reindex([label for label in order if label in table.index]).fillna(MISSING)
+    return table.rename_axis("configuration").reset_index()
+
+
+def making(tasks: Sequence[EvaluationTask], folder: Path) -> Tables:
+    """What was estimated and how, by name."""
+    return {
+        "parameters": frame.parameters(tasks, folder),
+        "truths": truth_table(tasks, folder),
+        "data": data_table(frame.estimates_made(tasks, folder), folder),
+        "ranges": range_table(tasks),
+        "costs": cost_table(tasks, folder),
+    }
+
+
+def truth_table(tasks: Sequence[EvaluationTask], folder: Path) -> pd.DataFrame:
+    """How accurately each recording is known: horizon, floor by cause [mm] and a verdict."""
+    rows = []
+    for source, judged in judged_motions(tasks, folder).items():
+        row: dict[str, Any] = {"recording": source.name, "horizon [s]": judged.horizon}
+        if not judged.inside.any():
+            rows.append(row | {"verdict": "no frame is known"})
+            continue
+        lengths = {"floor": float(judged.floor[judged.inside].mean())}
+        lengths |= {c: float(each[:, judged.inside].mean()) for c, each in judged.causes.items()}
+        row |= {f"{name} [mm]": 1e3 * length for name, length in lengths.items()}
+        row["verdict"] = verdict(*(lengths[c] for c in ("stiffness", "path", "mesh", "step")))
+        if isinstance(source, SimulatedRecording) and source.has_layers:
+            row["verdict"] = "not known: ensemble without self-contact"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def verdict(stiffness: float, path: float, mesh: float, step: float) -> str:
+    """Whether a truth is converged, from the mean distances of its ensemble [m]."""
+    if np.hypot(stiffness, path) > LEAST:
+        return "chaotic"
+    rest = float(np.hypot(mesh, step))
+    return "converged" if rest <= LEAST else f"not converged: {1e3 * rest:.1f} mm"
+
+
+def data_table(estimates: Iterable[EstimateTask], folder: Path) -> pd.DataFrame:
+    """What each approach reads of its recordings, by the first estimate."""
+    rows = {}
+    for task in estimates:
+        place = f"{task.approach} on {task.solver}", task.scenario
+        if place in rows or not all(source.is_made(folder) for source in task.sources):
+            continue
+        recordings = [read(source, folder) for source in task.sources]
+        reads = [method_of(task).reads(recording) for recording in recordings]
+        rows[place] = {
+            "approach": place[0],
+            "motion": place[1],
+            "recordings": len(recordings),
+            "frames": ", ".join(dict.fromkeys(str(len(data.frames)) for data in reads)),
+            "clouds": any(data.points != 0 for data in reads),
+            "markers": any(data.markers for data in reads),
+            "force of grippers": any(data.force for data in reads),
+            "prior": "fabrics" if task.informed else "flat",
+            "laws": task.law_from(recordings),
+        }
+    return pd.DataFrame(list(rows.values()))
+
+
+def range_table(tasks: Iterable[EvaluationTask]) -> pd.DataFrame:
+    """A line for each parameter of each solver, and for each fixed value."""
+    # estimates on points are predicted on the cloth, too
+    tasks = [c for c in tasks if c.estimate is not None and c.solver == c.estimate.solver]
+    rows = []
+    for solver in dict.fromkeys(task.solver for task in tasks):
+        own = [task for task in tasks if task.solver == solver]
+        laws = {task.estimate.law for task in own if task.estimate is not None}
+        law = "linear" if laws <= {"linear"} else "stiffening+softening"
+        space = with_law(default_space(solver, own[0].density), law)
+        for bound in space.ranges:
+            row = (bound.name, bound.unit, bound.low, bound.high, FROM.get(bound.name))
+            rows.append((solver, *row))
+        for density in dict.fromkeys(task.density for task in own):
+            for value in fixed(default_space(solver, density)):
+                row = (value.name, value.unit, value.value, value.value, value.origin)
+                rows.append((solver, *row))
+    header = ["solver", "parameter", "unit", "low", "high", "from"]
+    return pd.DataFrame(rows, columns=header).drop_duplicates()
+
+
+def cost_table(tasks: Sequence[EvaluationTask], folder: Path) -> pd.DataFrame:
+    """The costs of the finished tasks, their dependencies and ensembles, by compilation group."""
+    groups = defaultdict(list)
+    for task in with_dependencies([*ensembles(tasks), *tasks]):
+        if task.is_made(folder):
+            groups[task.compilation_group].append(read_metadata(task, folder))
+    rows = []
+    for group, noted in groups.items():
+        seconds = [metadata["cpu_seconds"] for metadata in noted]
+        memory = max(metadata["peak_memory_MB"] for metadata in noted)
+        rows.append((group, len(noted), sum(seconds), float(np.median(seconds)), memory))
+    times = ["CPU seconds in all", "CPU seconds of one (median)"]
+    return pd.DataFrame(rows, columns=["kind", "count", *times, "peak memory [MB]"])

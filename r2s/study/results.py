@@ -7,7 +7,7 @@ Columns of `results.csv`:
 - `recording`, `evaluated_on`: the recording that a prediction is compared with, and its motion.
 - `baseline`: "" for an estimate, else what it is compared with: "default" (samples of the prior),
   "middle" (median of the prior), "true" (fabric), "on_cloth" (estimated on points, predicted on the
-  cloth), "other_fabric" (the estimate of one), "repeatability" (another trial).
+  cloth).
 - `metric`, `unit`, `value`: SI, or "-" for a number without a unit; NaN where a run diverged.
 - `floor`: the accuracy of the recording itself, in that unit. `horizon`: the time up to which it
   discriminates between fabrics, [s]. `skill`: see `r2s.metrics.horizon`. NaN: not known.
@@ -17,7 +17,6 @@ number, however many recordings and estimates it has. All fabrics were moved ali
 contributions of a motion and of a repeat are common to all of them.
 """
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,12 +24,11 @@ from typing import Any
 import numpy as np
 
 from r2s._util.extras import require
-from r2s._util.files import write_text
 from r2s.estimation.default_spaces import law_of, with_law
 from r2s.estimation.method import default_space
 from r2s.materials.parameters import Range
-from r2s.metrics import prediction_error
 from r2s.metrics.horizon import skill
+from r2s.metrics.prediction_error import UNITS
 from r2s.metrics.statistics import CrossedMean, crossed_mean, interval
 from r2s.study.configuration import (
     MOTIONS,
@@ -42,7 +40,7 @@ from r2s.study.configuration import (
 from r2s.study.ensembles import SURFACE, judged_errors, judged_motions
 from r2s.study.estimates import EstimateTask, read_estimate
 from r2s.study.evaluations import EvaluationTask, read_predictions
-from r2s.study.recordings import SyntheticRecording, read, true_fabric
+from r2s.study.recordings import SyntheticRecording, true_fabric
 from r2s.study.tasks import with_dependencies
 
 for module in ("pandas", "statsmodels", "plotly", "jinja2"):
@@ -58,6 +56,7 @@ RUN = PLACE[:-1]
 CONFIGURATION = list(TEXTS[:3])
 ESTIMATE, DEFAULT = "", "default"
 CELL = ["configuration", "evaluated_on"]  # of a table of means
+FACTORS = ["fabric", "movement", "repeat"]  # of a mean over fabrics
 PARAMETERS = ("solver", "recording", "parameter", "unit", "value", "low", "high",
               "posterior_over_prior", "truth")  # fmt: skip
 
@@ -66,11 +65,6 @@ def as_frame(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """A table of results from rows with the keys of `COLUMNS`; numbers may be missing."""
     frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
     return frame.astype({**dict.fromkeys(TEXTS, object), **dict.fromkeys(NUMBERS, float)})
-
-
-def write_results(path: Path | str, results: pd.DataFrame) -> None:
-    """Write a table of results as CSV, completely or not at all; an OSError names `path`."""
-    write_text(path, results[list(COLUMNS)].to_csv(index=False, lineterminator="\n"))
 
 
 def labelled(results: pd.DataFrame) -> pd.DataFrame:
@@ -101,7 +95,7 @@ def _order(configuration: Configuration) -> tuple:
 
 def configurations(results: pd.DataFrame) -> list[Configuration]:
     """The configurations that have an estimate, in the order of `labelled`."""
-    own = results[(results.baseline == ESTIMATE) & (results.approach != "")]
+    own = results[results.baseline == ESTIMATE]
     rows = own[CONFIGURATION].drop_duplicates().itertuples(index=False)
     return sorted((Configuration(*row) for row in rows), key=_order)
 
@@ -123,7 +117,7 @@ def without_undefined(results: pd.DataFrame) -> pd.DataFrame:
 def fabrics_in_common(results: pd.DataFrame) -> list[str]:
     """The fabrics of which every configuration has an estimate, as means over different fabrics
     cannot be compared; all, where none has all."""
-    own = results[(results.baseline == ESTIMATE) & (results.approach != "")]
+    own = results[results.baseline == ESTIMATE]
     every = len(own[CONFIGURATION].drop_duplicates())
     counts = own[[*CONFIGURATION, "fabric"]].drop_duplicates().groupby("fabric").size()
     return list(counts.index[counts == every]) or list(dict.fromkeys(results.fabric))
@@ -187,7 +181,7 @@ def means(results: pd.DataFrame, column: str = "value") -> pd.DataFrame:
     rows = []
     for place, group in results.groupby(CELL, observed=True):
         worst = -np.inf if column == "skill" else np.inf
-        values = group.set_index(["fabric", "movement", "repeat"])[column]
+        values = group.set_index(FACTORS)[column]
         values = values.where(~group.diverged.to_numpy(), worst)
         mean_over_fabrics = crossed(values)
         mean, (low, high) = mean_over_fabrics.mean, interval(mean_over_fabrics)
@@ -198,34 +192,26 @@ def means(results: pd.DataFrame, column: str = "value") -> pd.DataFrame:
             mean, low, high = worst, np.nan, np.nan
         rows.append((*place, mean, low, high, float(np.median(values)), diverged, len(values)))
     header = [*CELL, "mean", "low", "high", "median", "diverged", "runs"]
-    return pd.DataFrame(rows, columns=header).set_index(CELL)
+    return pd.DataFrame(rows, columns=header).set_index(CELL).astype(float)
 
 
 def skills(results: pd.DataFrame) -> pd.DataFrame:
     """The skill of each configuration on each motion, see `means`; from `with_floor`.
 
     Further columns: `known`, in how many recordings a skill is known, of how many `judged`;
-    `floor`, its mean over fabrics.
+    `floor`, its mean.
     """
-    groups = results.groupby(CELL, observed=True)
     known = results[results.skill.notna()]
-    of_fabric = results.groupby([*CELL, "fabric", "movement"], observed=True).floor.mean()
-    floor = of_fabric.groupby([*CELL, "fabric"], observed=True).mean()
-    columns = {
-        "judged": groups.recording.nunique(),
-        "floor": floor.groupby(CELL, observed=True).mean(),
-        "known": known.groupby(CELL, observed=True).recording.nunique(),
-    }
-    table = pd.DataFrame(columns)
-    table["known"] = table.known.fillna(0).astype(int)
+    groups, of_known = (part.groupby(CELL, observed=True) for part in (results, known))
+    table = groups.agg(judged=("recording", "nunique"), floor=("floor", "mean"))
+    table["known"] = of_known.recording.nunique().reindex(table.index, fill_value=0)
     return table.join(means(known, "skill"))
 
 
 def collect(tasks: Sequence[EvaluationTask], folder: Path) -> pd.DataFrame:
-    """The results of all finished tasks (see above), and of given recordings the
-    distances between trials."""
+    """The results of all finished tasks (see above)."""
     known = judged_motions(tasks, folder)
-    rows: dict[tuple, dict[str, Any]] = {}  # trials may share a recording and its references
+    rows: list[dict[str, Any]] = []
     for task in tasks:
         if not task.is_made(folder):
             continue
@@ -240,44 +226,16 @@ def collect(tasks: Sequence[EvaluationTask], folder: Path) -> pd.DataFrame:
                 "baseline": task.baseline,
             }
             prediction = predictions[source.name]
-            own = {row["metric"]: row for row in _metrics(prediction.metrics)}
-            if source in known:
-                errors = judged_errors(source, prediction, task.shape, known[source], folder)
-                own |= {row["metric"]: row for row in errors}
-            for row in own.values():
-                full = place | row
-                rows.setdefault(tuple(full[name] for name in PLACE), full)
-    results = as_frame([*rows.values(), *_repeatability(tasks, folder)])
-    return with_skill(results, SURFACE)
-
-
-def _metrics(measured: dict[str, float]) -> list[dict[str, Any]]:
-    return [
-        {"metric": name, "unit": prediction_error.UNITS.get(name, "m"), "value": value}
-        for name, value in measured.items()
-    ]
-
-
-def _repeatability(tasks: Sequence[EvaluationTask], folder: Path) -> list[dict[str, Any]]:
-    """The distances between successive trials of a fabric in a motion, for given recordings."""
-    trials = defaultdict(list)
-    for source in dict.fromkeys(source for task in tasks for source in task.recordings):
-        if source.is_given and source.is_made(folder):
-            trials[source.fabric, source.scenario].append(source)
-    rows = []
-    for (fabric, scenario), sources in trials.items():
-        if len(sources) < 2:
-            continue
-        for first, second in zip(sources, sources[1:] + sources[:1], strict=True):
-            measured = prediction_error.against_recording(read(first, folder), read(second, folder))
-            place = dict.fromkeys(PLACE, "") | {
-                "fabric": fabric,
-                "recording": first.name,
-                "evaluated_on": scenario,
-                "baseline": "repeatability",
-            }
-            rows += [place | row for row in _metrics(measured)]
-    return rows
+            measured = [
+                {"metric": name, "unit": UNITS.get(name, "m"), "value": value}
+                for name, value in prediction.metrics.items()
+            ]
+            if source in known:  # which say more of the surface
+                measured = [row for row in measured if row["metric"] != SURFACE]
+                measured += judged_errors(source, prediction, task.shape, known[source], folder)
+            rows += [place | row for row in measured]
+    # trials may share a recording and its references
+    return with_skill(as_frame(rows).drop_duplicates(PLACE, ignore_index=True), SURFACE)
 
 
 def estimates_made(tasks: Iterable[EvaluationTask], folder: Path) -> list[EstimateTask]:

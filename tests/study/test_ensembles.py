@@ -16,7 +16,7 @@ from r2s.study.evaluations import EvaluationTask
 from r2s.study.figures import judged_recordings
 from r2s.study.plan import DRAWS
 from r2s.study.recordings import SyntheticRecording, TruthSettings, small_strain
-from r2s.study.tables import truth_table, verdict
+from r2s.study.report import truth_table, verdict
 
 FABRIC = "grey_interlock"
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from folders import ROOT
-from test_results import LIFTING, NOBODY, row
+from test_results import LIFTING
 
 from r2s.cli.main import main
 from r2s.estimation import default_spaces
@@ -30,8 +30,7 @@ from r2s.study.recordings import (
     small_strain,
     strain_dependent,
 )
-from r2s.study.results import as_frame
-from r2s.study.tables import cost_table, range_table, recording_table
+from r2s.study.report import cost_table, range_table
 from r2s.study.tasks import read_metadata, with_dependencies
 
 
@@ -151,7 +150,7 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     report.publish_study(cells, {}, tmp_path, plans.SMALL, "synthetic")
     assert "diffcloud" in (tmp_path / "report.html").read_text(encoding="utf-8")
     written = {path.stem for path in (tmp_path / "tables").iterdir()}
-    assert {"ranges", "costs", "parameters_cloth", "settings"} <= written
+    assert {"ranges", "costs", "parameters", "settings"} <= written
     costs = cost_table(cells, tmp_path).set_index("kind")
     assert costs["count"]["estimates diffcloud cloth lifting"] == 1
     assert float(costs["CPU seconds in all"]["evaluations cloth shaking"]) > 0
@@ -237,26 +236,6 @@ def test_a_fling_that_an_estimate_has_seen_does_not_judge_it(tmp_path, monkeypat
     assert judged_by == {(alone, "fling"), (alone, "shaking"), (together, "shaking")}
 
 
-def test_given_recordings_are_shown_one_by_one():
-    def of(baseline, value, recording="fold_silk", repeat="0", solver="cloth"):
-        whose = LIFTING if baseline in ("", "other_fabric", "on_cloth") else NOBODY
-        solver = "" if baseline == "repeatability" else solver
-        more = {"metric": "chamfer_real_to_sim", "recording": recording, "fabric": "silk"}
-        return row(value, baseline, whose._replace(solver=solver), repeat, **more)
-
-    rows = [of("", 0.02), of("default", 0.03), of("other_fabric", 0.025)]
-    rows += [of("repeatability", 0.01), of("", 0.09, repeat="1"), of("on_cloth", 0.5)]
-    rows += [of("default", 0.04, "fold_silk2"), of("default", 0.05, "fold_silk2", repeat="1")]
-    rows += [of("default", 0.7, solver="mpm")]
-    table = recording_table(as_frame(rows), "chamfer_real_to_sim").set_index("recording")
-    first, second = table.loc["fold_silk"], table.loc["fold_silk2"]
-    assert dict(first[["estimate", "default", "other_fabric", "repeatability"]]) == {
-        "estimate": 20.0, "default": 30.0, "other_fabric": 25.0, "repeatability": 10.0
-    }  # fmt: skip
-    assert second.default == 45.0 and np.isnan(second.estimate)
-    assert recording_table(as_frame(rows[:2]), "chamfer_real_to_sim").empty  # as synthetic ones
-
-
 def test_every_range_and_fixed_value_stands_in_the_table():
     table = range_table(plans.synthetic(plans.SMALL))
     shown = set(zip(table.solver, table.parameter, strict=True))
@@ -265,6 +244,3 @@ def test_every_range_and_fixed_value_stands_in_the_table():
         names = [each.name for each in (*space.ranges, *default_spaces.fixed(space))]
         assert {(solver, name) for name in names} <= shown
     assert table["from"].notna().all() and (table["from"] != "").all()
-    # as many densities as fabrics
-    densities = table[(table.solver == "mpm") & (table.parameter == "density")]
-    assert len(densities) == len(plans.SMALL.fabrics)
