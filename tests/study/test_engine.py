@@ -16,9 +16,6 @@ from folders import TESTS
 
 from r2s.study import engine, tasks
 from r2s.study.engine import environment
-from r2s.study.ensembles import EnsembleTask
-from r2s.study.evaluations import SHAPES, EvaluationTask
-from r2s.study.recordings import SETTLING
 from r2s.study.tasks import Task
 
 
@@ -107,7 +104,6 @@ def test_the_key_depends_on_all_that_results_do(monkeypatch):
     assert len({before, Number(2).key, sum_before, Sum((Number(1, 0.5),)).key}) == 4
     monkeypatch.setattr(Number, "settings", ((33, 33),))
     assert Number(1).key != before and Sum((Number(1),)).key != sum_before
-    assert SHAPES in EvaluationTask.settings and SETTLING in EnsembleTask.settings
 
 
 def test_a_damaged_result_is_made_again(tmp_path):

@@ -110,11 +110,6 @@ def estimate_of(name):
     return next(c.estimate for c in plans.synthetic(plan) if c.estimate is not None)
 
 
-def test_a_lift_and_pulls_are_of_three_directions():
-    task = estimate_of("diffcloud-cloth-lifting+stretching")
-    assert [getattr(each, "angle", None) for each in task.sources] == [None, 0.0, 45.0, 90.0]
-
-
 def test_multipliers_of_an_assumed_fabric_have_no_truth():
     task = estimate_of("diffcloud-published-cloth-lifting")
     ranges = (*default_space("cloth", task.density).ranges[:2], MULTIPLIER, MASS)
