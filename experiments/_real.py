@@ -95,9 +95,10 @@ def observed_of(
     if not np.isfinite(moved.x[used]).all():
         return None
     faces, clouds = np.asarray(scenario.scene.mesh.faces), []
-    for x, grippers in zip(moved.x[used], gripper_positions(recording)[used], strict=True):
-        points = observed(views, x, faces)
-        away = np.linalg.norm(points[:, None] - grippers[None], axis=-1).min(axis=1)
+    places = gripper_positions(recording)
+    for frame in used:
+        points = observed(views, moved.x[frame], faces, frame)
+        away = np.linalg.norm(points[:, None] - places[frame], axis=-1).min(axis=1)
         clouds.append(points[away > views.hidden])
     return clouds
 

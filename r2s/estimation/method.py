@@ -145,10 +145,12 @@ class Method(abc.ABC):
         estimate = self._estimate(list(recordings), space, budget or self.budget, key)
         pairs = zip(estimate.fits, recordings, strict=False)
         errors = np.sqrt(np.diag(np.linalg.inv(np.asarray(space.prior()[1], float))))
+        errors = errors * [bound.width for bound in space.ranges]
         return dataclasses.replace(
             estimate,
             fits=tuple(allowance(fit, recording, estimate) for fit, recording in pairs),
-            prior_errors=errors * [bound.width for bound in space.ranges],
+            # a recipe may estimate other parameters than those of the space, such as multipliers
+            prior_errors=errors if estimate.ranges == space.ranges else np.zeros(0),
             seconds=max(estimate.seconds, time.perf_counter() - began),  # of a resumed run
         )
 

@@ -246,19 +246,19 @@ def _to_clouds(
     neighbouring points; and which samples count, none in a frame without points."""
 
     def frame(args):
-        x, targets, mask, apart, grippers = args
+        x, targets, mask, apart, grippers, taken = args
         samples = jnp.einsum("sk,ski->si", expected.weights, x[expected.vertices])
         places = jax.lax.stop_gradient(samples)
         far = jnp.where(mask, 0, jnp.inf)
         pairs = jnp.sum((places[:, None] - targets[None]) ** 2, axis=-1) + far[None]
         gap = samples - targets[jnp.argmin(pairs, axis=1)]
-        counts = in_view(expected.views, places, grippers) & jnp.any(mask)
+        counts = in_view(expected.views, places, grippers, taken) & jnp.any(mask)
         away = length(gap)
         beyond = jnp.maximum(away - apart, 0) / jnp.maximum(away, TOUCHING)
         return jnp.where(counts[:, None], beyond[:, None] * gap, 0), counts
 
-    observed = expected.targets, expected.mask, expected.apart, expected.grippers
-    return jax.lax.map(frame, (x, *observed))
+    kept = expected.targets, expected.mask, expected.apart, expected.grippers, expected.taken
+    return jax.lax.map(frame, (x, *kept))
 
 
 def _gaps(markers: Markers, x: Float[Array, "frame vertex 3"]) -> Float[Array, "frame marker 3"]:

@@ -23,11 +23,11 @@ from r2s.recordings.recording import (
     MeasurementUncertainty,
     Recording,
     check_covered,
+    first_motion,
     gripper_positions,
-    is_at_rest,
     subsample,
 )
-from r2s.recordings.views import Views
+from r2s.recordings.views import Views, taken_by
 from r2s.scenarios.resolution import mpm_cloth
 from r2s.scenarios.scenario import Scenario, finely_saved, from_recording, rollout
 
@@ -115,7 +115,7 @@ class Markers(eqx.Module):
 class ImageObservation(eqx.Module):
     """Samples of the sheet that must lie near the clouds where cameras see them.
 
-    - `views`: the cameras, and the processing of their points.
+    - `views`: the cameras, and the processing of their points; `taken`: by which of them.
     - `vertices`, `weights`: samples of the sheet, off its borders.
     - `grippers`: in the frames that count, [m].
     - `targets`, `mask`: denser clouds of these frames, [m], and which points are no padding.
@@ -123,6 +123,7 @@ class ImageObservation(eqx.Module):
     """
 
     views: Views = eqx.field(static=True)
+    taken: Bool[Array, "frame camera"]
     vertices: Int[Array, "sample 3"]
     weights: Float[Array, "sample 3"]
     grippers: Float[Array, "frame gripper 3"]
@@ -209,7 +210,7 @@ class Problem(eqx.Module):
             thinned = subsample(recording, num_points, None, seed)
             clouds = Clouds(thinned.points[frames], thinned.mask[frames])
             knots, path = (np.asarray(a) for a in (recording.gripper_times, recording.gripper_path))
-            begins = first == 0 and is_at_rest(float(recording.times[0]), knots, path)
+            begins = first == 0 and float(recording.times[0]) <= first_motion(knots, path).shown
             if as_seen and scenario.brake is not None and begins:
                 middle = space(jnp.full(space.dim, 0.5, float))
                 scenario = start_as_seen(scenario, middle, clouds.points[0], clouds.mask[0])
@@ -353,7 +354,11 @@ def _expected(
     targets, mask = dense.points[frames], dense.mask[frames]
     clouds = [cloud[kept] for cloud, kept in zip(*map(np.asarray, (targets, mask)), strict=True)]
     apart = jnp.asarray([_apart(cloud) for cloud in clouds], float)
-    return ImageObservation(views, mesh.faces[face], weights, grippers, targets, mask, apart)
+    taken = np.zeros((len(recording.times), len(views.cameras)), bool)
+    for frame, row in enumerate(taken):
+        row[taken_by(views, frame)] = True
+    views, taken = dataclasses.replace(views, taken=()), jnp.asarray(taken[frames])
+    return ImageObservation(views, taken, mesh.faces[face], weights, grippers, targets, mask, apart)
 
 
 def _apart(cloud: Float[np.ndarray, "point 3"]) -> float:

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import CubicSpline
 from scipy.spatial import ConvexHull, QhullError
 
 SHARE = 0.5  # of the difference between fabrics
@@ -84,7 +85,7 @@ def skill(error: float, default: float, floor: float) -> float:
 def features(
     clouds: Sequence[Float[np.ndarray, "_ 3"]], times: Float[np.ndarray, " frame"]
 ) -> dict[str, float]:
-    """Means over the frames of a motion, from clouds of it or the vertices of a sheet.
+    """Means over the time of a motion, from clouds of it or the vertices of a sheet.
 
     - `width`, `depth`, `height`: extents along x, y and z, [m].
     - `sag`: from the highest to the mean point, [m].
@@ -93,26 +94,29 @@ def features(
     - `frequency`: mean frequency [1/s] of the power spectrum of the centroid's velocity, first
       moment over zeroth (Longuet-Higgins, Journal of Marine Research 11, 1952).
 
-    Raises `ValueError` for fewer than four frames or frames that are not evenly spaced.
+    Frames count by the time around them; the centroid is a cubic between them, of which speed and
+    spectrum are taken at as many even times. Raises `ValueError` for fewer than four frames or
+    times that do not increase.
     """
-    steps = np.diff(times)
     if len(clouds) != len(times) or len(times) < 4:
         raise ValueError(f"needs four frames or more, got {len(clouds)} at {len(times)} times")
-    if np.ptp(steps) > 1e-3 * steps.mean():
-        ends = f"{steps.min():g} to {steps.max():g} s"
-        raise ValueError(f"frames must be evenly spaced, got steps of {ends}")
-    extents = np.array([np.ptp(cloud, axis=0) for cloud in clouds]).mean(axis=0)
+    if not (np.diff(times) > 0).all():
+        raise ValueError(f"the frames' times [s] must increase, got {times}")
+    weights = np.gradient(times)
+    extents = np.average([np.ptp(cloud, axis=0) for cloud in clouds], axis=0, weights=weights)
     centroids = np.array([cloud.mean(axis=0) for cloud in clouds])
-    velocity = np.diff(centroids, axis=0) / steps.mean()
+    even, step = np.linspace(times[0], times[-1], len(times), retstep=True)
+    velocity = np.diff(CubicSpline(times, centroids)(even), axis=0) / step
     power = np.sum(np.abs(np.fft.rfft(velocity, axis=0)) ** 2, axis=1)
-    frequencies = np.fft.rfftfreq(len(velocity), steps.mean())
+    frequencies = np.fft.rfftfreq(len(velocity), step)
     total = power.sum()
+    sags = [cloud[:, 2].max() - cloud[:, 2].mean() for cloud in clouds]
     return {
         "width": float(extents[0]),
         "depth": float(extents[1]),
         "height": float(extents[2]),
-        "sag": float(np.mean([cloud[:, 2].max() - cloud[:, 2].mean() for cloud in clouds])),
-        "area": float(np.mean([_area(cloud[:, :2]) for cloud in clouds])),
+        "sag": float(np.average(sags, weights=weights)),
+        "area": float(np.average([_area(cloud[:, :2]) for cloud in clouds], weights=weights)),
         "speed": float(np.sqrt(np.mean(np.sum(velocity**2, axis=1)))),
         "frequency": float(power @ frequencies / total) if total > 0 else 0.0,
     }

@@ -26,24 +26,26 @@ def fit_cameras(
     alone: Sequence[Mapping[str, Points]],
     sheet: SheetPlacement,
     to_world: Callable[[Points], Points] = lambda points: points,
-    at_rest: bool = True,
+    still: Sequence[bool] | None = None,
 ) -> tuple[CameraFit, ...]:
     """What each camera of an RGB-D recording shows of the sheet at rest, and beside the others.
 
-    `at_rest`: whether the sheet is in the first frame, else it is not compared with its place.
-    `alone`: each frame's points [m] by camera, in the cameras' world
-    (`read_clouds`), which `to_world` moves into the recording's.
+    `alone`: each frame's points [m] by the cameras that took it, in the cameras' world
+    (`read_clouds`), which `to_world` moves into the recording's. `still`: in which frames the sheet
+    is at rest (None: in all); a camera is compared with its place in the first that it took.
     """
-    chosen = np.unique(np.linspace(0, len(alone) - 1, FRAMES).round().astype(int))
-    read = [{n: part for n, part in alone[i].items() if len(part) >= FEWEST} for i in chosen]
-    # as if the depth in the files was along the other of axis and ray
-    other = [{n: _switched(cameras[n], part) for n, part in each.items()} for each in read]
+    seen = [{n: part for n, part in each.items() if len(part) >= FEWEST} for each in alone]
     axes = np.array([sheet.warp, sheet.weft, np.cross(sheet.warp, sheet.weft)])
     fits = []
     for name, camera in cameras.items():
+        own = [frame for frame, each in enumerate(alone) if name in each]
+        chosen = np.unique(np.linspace(0, len(own) - 1, min(FRAMES, len(own))).round().astype(int))
+        read = [seen[own[i]] for i in chosen]
+        # as if the depth in the files was along the other of axis and ray
+        other = [{n: _switched(cameras[n], part) for n, part in each.items()} for each in read]
         off = [_apart(frames, name) for frames in (read, other)]
         fit = {"apart": off[0]}
-        if at_rest and name in read[0]:
+        if read and name in read[0] and (still is None or still[own[0]]):
             rest, bowl = ((to_world(f[0][name]) - sheet.origin) @ axes.T for f in (read, other))
             if np.mean(np.abs(rest[:, 2]) < AROUND) > 0.9:
                 if abs(axes[2, 2]) > 0.9:  # what hangs is bent by its weight

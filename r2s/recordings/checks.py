@@ -12,12 +12,12 @@ from scipy.spatial import KDTree
 from r2s.recordings.clouds import outliers, voxel_means
 from r2s.recordings.recording import (
     CORNERS,
-    STILL,
     Recording,
     SheetPlacement,
     cloud,
     clouds_are_markers,
     corner,
+    first_motion,
     gripper_positions,
 )
 from r2s.recordings.strays import BEYOND, reach, share, strays, without_strays
@@ -171,9 +171,8 @@ def check(recording: Recording) -> list[Finding]:
     sparse = clouds_are_markers(recording)
     clouds = thinned if sparse else [_pieces(points) for points in thinned]
     path, knots = np.asarray(recording.gripper_path), np.asarray(recording.gripper_times)
-    moved = np.linalg.norm(path - path[:1], axis=-1).max(axis=1) > STILL
-    start = float(knots[np.argmax(moved)]) if moved.any() else INF
-    still = np.flatnonzero(np.asarray(recording.times) <= start).tolist() or [0]
+    shown = first_motion(knots, path).shown
+    still = np.flatnonzero(np.asarray(recording.times) <= shown).tolist() or [0]
     frames = _Frames(recording, thinned, clouds, gripper_positions(recording), still)
     findings = [*_check_sheet(frames), *_check_clock(frames)]
     if not sparse:
@@ -215,9 +214,11 @@ def _check_sheet(frames: _Frames) -> list[Finding]:
     if _lies(recording.info.sheet):
         findings = _lying(recording, first)
     else:  # at rest it hangs below its grippers
-        away = first.mean(axis=0) - frames.grippers[0].mean(axis=0)
-        tilt = float(np.degrees(np.arctan2(np.hypot(away[0], away[1]), -away[2])))
-        findings = [_finding("plumb", tilt, name="gravity")]
+        tilt, why = np.nan, "the frame at rest has no two points near each other"
+        if len(first):
+            away = first.mean(axis=0) - frames.grippers[frames.still[0]].mean(axis=0)
+            tilt, why = float(np.degrees(np.arctan2(np.hypot(away[0], away[1]), -away[2]))), ""
+        findings = [_finding("plumb", tilt, why, "gravity")]
     return [*findings, *_extents(frames), _marker_distances(recording)]
 
 
@@ -281,12 +282,18 @@ def _marker_distances(recording: Recording) -> Finding:
         return _finding("markers", np.nan, "no markers")
     markers, seen = np.asarray(recording.markers), np.asarray(recording.markers_seen)
     places = recording.marker_places
-    places = markers[0] if places is None else np.asarray(places)
+    if places is None:  # they are where the first frame shows them
+        places, markers, seen = markers[0, seen[0]], markers[:, seen[0]], seen[:, seen[0]]
+    if len(places) < 2:
+        return _finding("markers", np.nan, "fewer than two, whose places on the sheet are known")
+    places = np.asarray(places)
     gaps, nearest = KDTree(places).query(places, 2)
     gaps, nearest = gaps[:, 1], np.asarray(nearest)[:, 1]
     apart = np.linalg.norm(markers - markers[:, nearest], axis=-1) / gaps
     both = seen & seen[:, nearest]
-    return _finding("markers", float(np.quantile(apart[both], 0.95)) if both.any() else np.nan)
+    if not both.any():
+        return _finding("markers", np.nan, "no two neighbours are seen in one frame")
+    return _finding("markers", float(np.quantile(apart[both], 0.95)))
 
 
 # The clock: do the frames come when they should, and when the grippers move?

@@ -2,7 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -13,10 +13,12 @@ from jaxtyping import Float
 from r2s.recordings.clouds import list_frames
 from r2s.recordings.force_log import check_increasing, number_in, read_lines
 
+TABLE = "times.csv"  # in a folder of frames: their times [s], read by `read_times`
 LONGEST = 5.0  # [s] between frames: above, times are taken for milliseconds or nanoseconds
 EPOCH = 1e6  # [s]: later times count from 1970, or from when a machine was started
 DIGITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}  # of stamps that are whole numbers, and their unit [s]
 MOST_MISSING = 0.9  # of the frames, or their numbers are something else
+MOST_BEYOND = 0.5  # of the frames that count, that may be dropped at the end
 DAY = re.compile(  # as in 2026-11-30_21-33-59.900, or 20261130_213359.900
     r"(?<!\d)(\d{4})-?([01]\d)-?([0-3]\d)[T_ -]([0-2]\d)[-:_]?([0-5]\d)[-:_]?([0-5]\d)"
     r"\.(\d{1,9})(?!\d)"
@@ -77,19 +79,26 @@ def find_frames(folder: Path | str, suffixes: Collection[str], first: int | None
     start = keys[0] if first is None else first
     if keys[0] < start:
         raise ValueError(f"{folder}: frame {keys[0]} comes before the first frame, {start}")
-    return Frames([frames[key] for key in keys], keys, [int(key - start) for key in keys], None)
+    return numbered_from(Frames([frames[key] for key in keys], keys, [], None), start)
 
 
-def times_of(
-    folder: Path, frames: Frames, rate: float, table: Path | None = None
-) -> Float[np.ndarray, " frame"]:
+def numbered_from(frames: Frames, first: int) -> Frames:
+    """Frames whose numbers are those in their names less `first`; others as they are."""
+    if frames.stamps is not None:
+        return frames
+    return frames._replace(numbers=[int(key - first) for key in frames.keys])
+
+
+def has_table(folder: Path) -> bool:
+    """Whether a folder of frames has a file of their times."""
+    return (folder / TABLE).is_file()
+
+
+def times_of(folder: Path, frames: Frames, rate: float) -> Float[np.ndarray, " frame"]:
     """The times [s] of frames: those of a file, else the stamps in their names, else their numbers
-    over a rate [Hz], with a warning where numbers are missing.
-
-    `table`: a CSV as for `read_times`; None: times.csv in the folder, where there is one.
-    """
-    path = table or folder / "times.csv"
-    if table is not None or path.is_file():
+    over a rate [Hz], with a warning where numbers are missing."""
+    path = folder / TABLE
+    if has_table(folder):
         times = read_times(path)
         if len(times) != len(frames.files):
             raise ValueError(
@@ -119,6 +128,22 @@ def times_of(
             stacklevel=2,
         )
     return np.array(frames.numbers) / rate
+
+
+def places_of(folder: Path, used: Sequence[int], numbers: Sequence[int]) -> tuple[int, int]:
+    """The first and the last frame that count, by their places, from those of their numbers, which
+    may be of frames that were dropped. `used` empty: all."""
+    if not used:
+        return 0, len(numbers) - 1
+    first, last = used
+    places = [place for place, number in enumerate(numbers) if first <= number <= last]
+    beyond, words = last - numbers[-1], f"{folder}: frames_used is {first}..{last}, but the frames"
+    words += f" are numbered 0 to {numbers[-1]}, counted from the first"
+    if not places or beyond > MOST_BEYOND * (last - first + 1):
+        raise ValueError(words)
+    if beyond > 0:
+        warnings.warn(f"{words}: the last ones are taken to be dropped", stacklevel=3)
+    return places[0], places[-1]
 
 
 def read_times(path: Path) -> Float[np.ndarray, " frame"]:

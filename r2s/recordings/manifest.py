@@ -6,16 +6,15 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from r2s._util.files import read_json
 from r2s._util.units import not_negative, positive
-from r2s.recordings.camera_fits import fit_cameras
 from r2s.recordings.cameras import is_rotation
-from r2s.recordings.clocks import EPOCH, find_frames, times_of
+from r2s.recordings.clocks import EPOCH, TABLE, Frames, find_frames, places_of, times_of
 from r2s.recordings.clouds import READERS, read_frames, read_values
 from r2s.recordings.gripper_paths import ORDERS, Track, merged, read_track, with_tool
 from r2s.recordings.recording import (
@@ -23,10 +22,19 @@ from r2s.recordings.recording import (
     Recording,
     RecordingInfo,
     SheetPlacement,
-    is_at_rest,
+    first_motion,
     make_recording,
 )
-from r2s.recordings.rgbd import find_rig, frame_times, read_clouds, read_rig
+from r2s.recordings.rgbd import (
+    Images,
+    Rig,
+    between,
+    find_images,
+    find_rig,
+    read_clouds,
+    read_rig,
+    with_cameras,
+)
 from r2s.recordings.segmentation import FrameCuts, Segmentation, Segmenter, read_colours
 from r2s.recordings.strays import at_one_place, check_unit
 from r2s.recordings.views import Views, shifted
@@ -237,26 +245,62 @@ def read_recordings(
     return [n for n in names if any(re.fullmatch(manifest.scenarios[s].folder, n) for s in wanted)]
 
 
-def sources(folder: Path | str, manifest: Manifest, name: str) -> list[Path]:
+class Found(NamedTuple):
+    """A recording in a folder: what it is read from, listed once.
+
+    - `folder`: its own. `match`: of its name, with the groups fabric and trial.
+    - `grippers`: the files of the grippers' paths.
+    - `rig`, `frames`: the cameras of RGB-D images, and these; None, and files of clouds.
+    """
+
+    folder: Path
+    scenario_name: str
+    scenario: Scenario
+    match: re.Match[str]
+    grippers: list[Path]
+    rig: Rig | None
+    frames: Images | Frames
+
+    @property
+    def segmentation(self) -> Segmentation | None:
+        """How the cloth is cut out: as cameras.json says, else as the scenario does."""
+        return (self.rig and self.rig.segmentation) or self.scenario.segmentation
+
+
+def find(folder: Path | str, manifest: Manifest, name: str) -> Found:
+    """The recording of a name in a folder; raises as `read_recording`."""
+    folder = Path(folder)
+    known = list(manifest.scenarios.items())
+    index, match = _matching(name, [scenario.folder for _, scenario in known], "scenarios")
+    scenario_name, scenario = known[index]
+    parts = {"name": name, "fabric": match["fabric"], "trial": match["trial"] or "1"}
+    files = scenario.gripper.file
+    for key, value in parts.items():
+        files = files.replace(f"{{{key}}}", value)
+    grippers = [folder / file.strip() for file in files.split(";")]
+    rig = read_rig(folder / name) if find_rig(folder / name) else None
+    found = folder / name, scenario_name, scenario, match, grippers, rig
+    if rig is None:
+        return Found(*found, find_frames(folder / name, READERS, scenario.first_frame))
+    how = rig.segmentation or scenario.segmentation
+    coloured = how is not None and how.colour is not None
+    return Found(*found, find_images(folder / name, rig, scenario.frame_rate, coloured))
+
+
+def sources(found: Found) -> list[Path]:
     """The files that a recording is read from, as far as they exist, sorted.
 
-    Its manifest, the gripper's path, cameras.json, and all in its folder, but colour images only
+    Its manifest, the gripper's path, cameras.json, times, clouds or images; colour images only
     where a segmentation reads them.
     """
-    folder = Path(folder)
-    _, scenario, match = _scenario_of(manifest, name)
-    grippers = _gripper_files(folder, scenario, name, match)
-    how = _segmentation(folder / name, scenario)
-    left_out = () if how is not None and how.colour is not None else ("colour",)
-    inside = (path for path in (folder / name).rglob("*") if path.parent.name not in left_out)
-    files = (manifest_of(folder), *grippers, find_rig(folder / name), *inside)
+    folder, frames = found.folder, found.frames
+    files = [manifest_of(folder.parent), find_rig(folder), folder / TABLE, *found.grippers]
+    if isinstance(frames, Frames):
+        files += frames.files
+    else:
+        files += [path for shots in frames.shots for shot in shots.values() for path in shot]
+        files += [folder / name / TABLE for name in found.rig.cameras] if found.rig else []
     return sorted({path for path in files if path is not None and path.is_file()})
-
-
-def _segmentation(folder: Path, scenario: Scenario) -> Segmentation | None:
-    """How the cloth of the recording in a folder is cut out: as cameras.json says, else as here."""
-    own = read_rig(folder).segmentation if find_rig(folder) else None
-    return own or scenario.segmentation
 
 
 def read_recording(
@@ -265,75 +309,70 @@ def read_recording(
     name: str,
     watch: Watch = iter,
     cuts: list[FrameCuts] | None = None,
+    found: Found | None = None,
 ) -> Recording:
     """The recording in `folder`/`name`, of clouds or of RGB-D images, in metres and seconds.
 
     Frames are read through `watch`, such as a bar that shows progress. What a segmentation does to
-    each is appended to `cuts`.
+    each is appended to `cuts`. `found`: what `find` found, if it is known.
 
     `info.verified`: True if all its files have the values listed in the manifest, None if some are
     not listed; False, with a warning, if a listed one differs or is missing.
 
     Raises FileNotFoundError or a ValueError that names the file or folder.
     """
-    folder = Path(folder)
-    scenario_name, scenario, match = _scenario_of(manifest, name)
-    paths = _gripper_files(folder, scenario, name, match)
-    track, held = _held(paths, scenario.gripper)
+    found = found or find(folder, manifest, name)
+    place, scenario, rig, frames = found.folder, found.scenario, found.rig, found.frames
+    track, held = _held(found.grippers, scenario.gripper)
     shift, views = _in_session(scenario, name)
 
     def in_world(points: np.ndarray) -> np.ndarray:
         return to_world(scenario.cloud, points) + np.array(shift)
 
-    cuts, rate = [] if cuts is None else cuts, scenario.frame_rate
-    alone: list[dict[str, np.ndarray]] = []  # by camera
-    if (rig := read_rig(folder / name) if find_rig(folder / name) else None) is not None:
-        times = frame_times(folder / name, rig, rate)
-        frames, used = None, _used(folder / name, scenario.frames_used, range(len(times)))
+    if isinstance(frames, Images):
+        times = frames.times
     else:
-        frames = find_frames(folder / name, READERS, scenario.first_frame)
-        times = times_of(folder / name, frames, rate)
-        used = _used(folder / name, scenario.frames_used, frames.numbers)
+        times = times_of(place, frames, scenario.frame_rate)
+    used = places_of(place, scenario.frames_used, frames.numbers)
     knots, start = _clocks(name, track, times, scenario)
     clock = knots - scenario.time_offset  # that of the frames
-    segmenter = _segmenter(folder / name, scenario, in_world, held, clock, used, cuts)
-    if frames is None:
-        assert rig is not None
-        times, clouds = read_clouds(folder / name, rig, rate, watch, segmenter, alone)
-        verified = None
+    cuts, segmenter = [] if cuts is None else cuts, None
+    if (how := found.segmentation) is not None:
+        known = how, scenario.sheet, scenario.table_height, held, clock, str(place), in_world
+        segmenter = Segmenter(*known, between(times, used), cuts)
+    info = RecordingInfo(
+        name=name,
+        scenario=found.scenario_name,
+        fabric=found.match["fabric"],
+        trial=found.match["trial"] or "1",
+        source=str(place),
+        frames_used=used,
+        sheet=scenario.sheet,
+        table_height=scenario.table_height,
+        verified=None,
+        time_offset=scenario.time_offset,
+        doubt=scenario.doubt,
+        views=views,
+    )
+    if rig is not None and isinstance(frames, Images):
+        alone: list[dict[str, np.ndarray]] = []  # by camera
+        times, clouds = read_clouds(place, rig, frames, watch, segmenter, alone)
+        still = (times <= first_motion(clock, held).shown).tolist()
+        info = with_cameras(info, rig, alone, np.isin(frames.times, times), still, in_world)
     else:
+        assert isinstance(frames, Frames)
         clouds = read_frames(watch(frames.files))
-        verified = _verified(manifest, name, frames.files, clouds, paths)
+        info = _verified(info, manifest, frames.files, clouds, found.grippers)
         if segmenter is not None:
             clouds = _cut_out(segmenter, frames.files, times, clouds)
         if scenario.drop_repeats:
             clouds = [_distinct(points) for points in clouds]
-    if views is not None and segmenter is not None and cuts:  # what is cut off is not seen
-        views = replace(views, hidden=max(views.hidden, segmenter.how.gripper_radius))
-    fits = ()
-    if rig is not None:
-        at_rest = is_at_rest(float(times[0]), clock, held)
-        fits = fit_cameras(rig.cameras, alone, scenario.sheet, in_world, at_rest)
-    source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
-    info = RecordingInfo(
-        name=name,
-        scenario=scenario_name,
-        fabric=match["fabric"],
-        trial=match["trial"] or "1",
-        source=source if verified else str(folder / name),
-        frames_used=used,
-        sheet=scenario.sheet,
-        table_height=scenario.table_height,
-        verified=verified,
-        time_offset=scenario.time_offset,
-        doubt=scenario.doubt,
-        views=views,
-        camera_fits=fits,
-    )
+    if info.views is not None and segmenter is not None and cuts:  # what is cut off is not seen
+        hidden = max(info.views.hidden, segmenter.how.gripper_radius)
+        info = replace(info, views=replace(info.views, hidden=hidden))
     clouds = [in_world(points) for points in clouds]
-    check_unit(folder / name, clouds[0], scenario.sheet.size)
-    times = times - start + scenario.time_offset
-    return make_recording(clouds, times, held, knots - start, info)
+    check_unit(place, clouds[0], scenario.sheet.size)
+    return make_recording(clouds, times - start + scenario.time_offset, held, knots - start, info)
 
 
 def _clocks(name: str, track: Track, times: np.ndarray, scenario: Scenario):
@@ -352,15 +391,6 @@ def _clocks(name: str, track: Track, times: np.ndarray, scenario: Scenario):
             "difference as time_offset [s]"
         )
     return knots, start
-
-
-def _gripper_files(folder: Path, scenario: Scenario, name: str, match: re.Match[str]) -> list[Path]:
-    """The files of the grippers' paths of a recording."""
-    parts = {"name": name, "fabric": match["fabric"], "trial": match["trial"] or "1"}
-    files = scenario.gripper.file
-    for key, value in parts.items():
-        files = files.replace(f"{{{key}}}", value)
-    return [folder / file.strip() for file in files.split(";")]
 
 
 def _held(files: Sequence[Path], gripper: Gripper) -> tuple[Track, np.ndarray]:
@@ -390,31 +420,6 @@ def _held(files: Sequence[Path], gripper: Gripper) -> tuple[Track, np.ndarray]:
     return track, track.positions + np.array(gripper.offset)
 
 
-def _used(folder: Path, used: tuple[int, ...], numbers: Sequence[int]) -> tuple[int, int]:
-    """The first and the last frame that count, by their places, from those of their numbers."""
-    if not used:
-        return 0, len(numbers) - 1
-    places = [place for place, number in enumerate(numbers) if used[0] <= number <= used[1]]
-    if used[1] > numbers[-1] or not places:
-        raise ValueError(
-            f"{folder}: frames_used is {used[0]}..{used[1]}, but the frames are numbered 0 to "
-            f"{numbers[-1]}, counted from the first"
-        )
-    return places[0], places[-1]
-
-
-def _segmenter(
-    folder: Path, scenario: Scenario, in_world: Any, path: Any, clock: Any, used: Any, cuts: Any
-) -> Segmenter | None:
-    """What cuts the cloth of a recording out of its frames; None: all points are of the cloth."""
-    if (how := _segmentation(folder, scenario)) is None:
-        return None
-    return Segmenter(
-        *(how, scenario.sheet, scenario.table_height, path, clock, str(folder)),
-        *(in_world, used, cuts),
-    )
-
-
 def _cut_out(segmenter: Segmenter, files: Sequence[Path], times: Any, clouds: Any) -> list[Any]:
     """The clouds of files at times without what is not of the cloth; errors name the file."""
     kept = []
@@ -434,13 +439,6 @@ def _matching(name: str, patterns: Sequence[str], kind: str) -> tuple[int, re.Ma
     return fits[0]
 
 
-def _scenario_of(manifest: Manifest, name: str) -> tuple[str, Scenario, re.Match[str]]:
-    """The scenario of a recording, and the match of its folder with groups fabric and trial."""
-    known = list(manifest.scenarios.items())
-    index, match = _matching(name, [scenario.folder for _, scenario in known], "scenarios")
-    return *known[index], match
-
-
 def _in_session(scenario: Scenario, name: str) -> tuple[Vector, Views | None]:
     """The shift of a recording's clouds [m], and the views with it."""
     if not scenario.sessions:
@@ -455,24 +453,27 @@ def _in_session(scenario: Scenario, name: str) -> tuple[Vector, Views | None]:
 
 
 def _verified(
-    manifest: Manifest, name: str, files: Sequence[Path], clouds: Sequence[Any], paths: Any
-) -> bool | None:
-    """Whether clouds and the grippers' paths are those of a manifest; see `_verify`."""
-    values = {f"{name}/{f.name}": c for f, c in zip(files, clouds, strict=True)}
+    info: RecordingInfo,
+    manifest: Manifest,
+    files: Sequence[Path],
+    clouds: Sequence[np.ndarray],
+    paths: Sequence[Path],
+) -> RecordingInfo:
+    """With whether clouds and the grippers' paths are those listed in a manifest."""
+    values = {f"{info.name}/{f.name}": c for f, c in zip(files, clouds, strict=True)}
     values |= {f.name: read_values(f) for f in paths if f.suffix == ".npy"}
-    return _verify(manifest.files, name, values)
-
-
-def _verify(listed: Mapping[str, str], name: str, values: Mapping[str, np.ndarray]) -> bool | None:
-    """Whether values of files are those listed for a recording; None: some are not listed."""
+    listed = manifest.files
     differ = [f for f, v in values.items() if f in listed and hash_values(v) != listed[f]]
-    differ += [f for f in listed if f.startswith(f"{name}/") and f not in values]
+    differ += [f for f in listed if f.startswith(f"{info.name}/") and f not in values]
     if differ:
-        warnings.warn(
-            f"{name}: not the published values, or missing: {', '.join(differ)}", stacklevel=3
-        )
-        return False
-    return True if values.keys() <= listed.keys() else None
+        words = f"{info.name}: not the published values, or missing: {', '.join(differ)}"
+        warnings.warn(words, stacklevel=3)
+        return replace(info, verified=False)
+    if not values.keys() <= listed.keys():
+        return info
+    source = manifest.source
+    words = f"{source.repository} {source.commit} {source.path}"
+    return replace(info, verified=True, source=words)
 
 
 def _distinct(points: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from r2s.recordings.checks import at_conversion
 from r2s.recordings.datasets import known_bar
 from r2s.recordings.manifest import (
     Manifest,
+    find,
     manifest_for,
     manifest_of,
     read_recording,
@@ -165,7 +166,8 @@ def _convert_one(
 ) -> str:
     file, mark = to / f"{name}.npz", to / f"{name}.sha256"
     total = hashlib.sha256(FORMAT.encode())
-    for source in sources(root, manifest, name):
+    found = find(root, manifest, name)
+    for source in sources(found):
         total.update(
             f"\0{source.relative_to(root) if source.is_relative_to(root) else ''}\0".encode()
         )
@@ -179,7 +181,7 @@ def _convert_one(
     bar = partial(tqdm, desc=label, unit=" frames", disable=None, leave=False)
     cuts: list[FrameCuts] = []
     try:
-        recording = read_recording(root, manifest, name, bar, cuts)
+        recording = read_recording(root, manifest, name, bar, cuts, found)
     finally:  # it also shows why a recording is refused
         if draw is not None and cuts:
             draw(to / f"{name}_cuts.png", name, cuts)

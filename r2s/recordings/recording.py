@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,14 +16,16 @@ from r2s._util.units import positive
 from r2s.recordings.clouds import draw_points, numbers, voxel_means
 from r2s.recordings.views import CameraFit, Views
 
-FORMAT = "r2s-recording/4"
+FORMAT = "r2s-recording/5"
 # the first knew neither force nor markers nor wind, the second neither doubt nor views, the third
-# no fits of cameras
-READABLE = ("r2s-recording/1", "r2s-recording/2", "r2s-recording/3", FORMAT)
+# no fits of cameras, the fourth not which camera took a frame
+READABLE = tuple(f"r2s-recording/{version}" for version in range(1, 6))
 CORNERS = {"origin": (0, 0), "warp": (1, 0), "weft": (0, 1), "opposite": (1, 1)}
 OPTIONAL = ("force", "force_times", "markers", "markers_seen", "marker_places")
 PATH = ("knot", "gripper", 3)
-STILL = 2e-3  # [m], within which grippers are at rest
+STILL = 2e-3  # [m]: a gripper that goes farther than this moves; at rest robots jitter by less
+JITTER, FEWEST = 4.0, 10  # standard deviations of it, within which knots are at rest; of so many
+EXACT = 1e-6  # [m], the same of a path without jitter
 STEP = 0.025  # [s], the longest of a simulation
 CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rate
 
@@ -193,6 +195,8 @@ def make_recording(
                 f"frames_used is {first}..{last}, but there are {len(clouds)} frames: they count "
                 "from 0, the last one included"
             )
+        if info.views and len(info.views.taken) not in (0, len(clouds)):
+            raise ValueError(f"views: taken has {len(info.views.taken)} of {len(clouds)} frames")
         if markers is not None and len(markers) != len(clouds):
             raise ValueError(f"markers in {len(markers)} frames, but clouds in {len(clouds)}")
         if marker_places is not None:
@@ -257,12 +261,40 @@ def gripper_positions(recording: Recording) -> Float[np.ndarray, "frame gripper 
     return interpolated(*(np.asarray(array, np.float64) for array in arrays))
 
 
-def is_at_rest(
-    time: float, knots: Float[np.ndarray, " knot"], path: Float[np.ndarray, "knot gripper 3"]
-) -> bool:
-    """Whether the grippers are still where their path [m] begins, at a time [s]."""
-    until = np.concatenate([path[knots <= time], interpolated(np.array([time]), knots, path)])
-    return bool(np.linalg.norm(until - path[0], axis=-1).max() < STILL)
+class FirstMotion(NamedTuple):
+    """When grippers begin to move, [s]: `begin`, the last knot at rest, and `shown`, when the first
+    of them is `STILL` from where it was. Infinite where none goes so far."""
+
+    begin: float
+    shown: float
+
+
+def first_motion(
+    knots: Float[np.ndarray, " knot"], path: Float[np.ndarray, "knot gripper 3"]
+) -> FirstMotion:
+    """The first motion of the grippers along a path [m] with knots at some times [s].
+
+    Any that goes farther than `STILL` counts, however slow, and from its begin on. What a robot
+    jitters at rest does not: its deviation is that of knots from a smooth motion.
+    """
+    away = np.linalg.norm(path - path[0], axis=-1).max(axis=1)
+    if not (away > STILL).any():
+        return FirstMotion(np.inf, np.inf)
+    end = int(np.argmax(away > STILL))  # not 0: the path begins there
+    shown = np.interp(STILL, away[end - 1 : end + 1], knots[end - 1 : end + 1])
+    jitter = 0.0
+    if end >= FEWEST:
+        off, times = path[:end], knots[:end]
+        for _ in range(2):  # from the middle of the neighbours: twice, a steady acceleration is 0
+            steps = np.diff(times)
+            share = (steps[:-1] / (steps[:-1] + steps[1:]))[:, None, None]
+            off = off[1:-1] - off[:-2] - share * (off[2:] - off[:-2])
+            times = times[1:-1]
+        # (1 + 16 + 36 + 16 + 1) / 16 of the variance; of three axes the median of the sum is 2.366
+        square = np.median(np.sum(off**2, axis=-1), axis=0).max()
+        jitter = float(np.sqrt(square / (70 / 16 * 2.366)))
+    rest = np.flatnonzero(away[:end] <= max(JITTER * jitter, EXACT))
+    return FirstMotion(float(knots[rest[-1]]), float(shown))
 
 
 def interpolated(
@@ -274,6 +306,12 @@ def interpolated(
     columns = values.reshape(len(values), -1).T
     between = np.stack([np.interp(times, knots, column) for column in columns], axis=1)
     return between.reshape(-1, *values.shape[1:])
+
+
+def lasts(times: Float[np.ndarray, " frame"]) -> Float[np.ndarray, " frame"]:
+    """How long [s] each frame lasts when they are played: until the next, the last as most do."""
+    gaps = np.diff(times)
+    return np.append(gaps, np.median(gaps) if len(gaps) else 1.0)
 
 
 def check_covered(clock: Float[np.ndarray, " sample"], times: Float[np.ndarray, " frame"]) -> None:

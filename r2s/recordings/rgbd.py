@@ -15,25 +15,26 @@ and `cameras.json` lies there, or in the folder above for all recordings of one 
 import hashlib
 import itertools
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 from r2s._util.files import read_json
 from r2s.recordings import images
 from r2s.recordings.camera_fits import fit_cameras
 from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved, rays
-from r2s.recordings.clocks import Frames, find_frames, times_of
+from r2s.recordings.clocks import Frames, find_frames, has_table, numbered_from, places_of, times_of
 from r2s.recordings.clouds import Cleaning, clean, inside, voxel_means
-from r2s.recordings.recording import Recording, RecordingInfo, is_at_rest, make_recording
+from r2s.recordings.recording import Recording, RecordingInfo, first_motion, make_recording
 from r2s.recordings.segmentation import Segmentation, Segmenter
 
 NAME = "cameras.json"
+ROUNDED = 1e-3  # [s], of printed times: masks and depth images are of one frame that are nearer
 TOGETHER = 0.005  # [s]: frames of several cameras that are nearer in time are one frame
 MOST = 0.5  # of the points behind a mask: at least so many are in the workspace
 DISAGREE = 0.005  # [m]: cameras whose clouds are closer than this are not swapped
@@ -118,6 +119,65 @@ def find_rig(folder: Path | str) -> Path | None:
     return next((path for path in places if path.is_file()), None)
 
 
+class Shot(NamedTuple):
+    """The images of a camera in a frame; None: there is none, or it is not read."""
+
+    depth: Path
+    mask: File
+    colour: File
+
+
+class Images(NamedTuple):
+    """The images of a recording as they lie in its folder.
+
+    - `times`: of the frames of all cameras, on their clock, [s].
+    - `numbers`: of the frames: those in the names of images that have no times, else 0, 1, ...
+    - `shots`: of each frame, by the cameras that took it.
+    """
+
+    times: Float[np.ndarray, " frame"]
+    numbers: list[int]
+    shots: list[dict[str, Shot]]
+
+
+def find_images(folder: Path | str, rig: Rig, rate: float = 0.0, coloured: bool = False) -> Images:
+    """The images in the folder of a recording, paired by their times.
+
+    `rate` [Hz] is used where the rig has none. `coloured`: whether cameras without masks need
+    colours. Raises FileNotFoundError, or ValueError that names the file or camera and frame.
+    """
+    folder = Path(folder)
+    found: dict[str, Frames] = {}
+    for name in rig.cameras:
+        if not (folder / name).is_dir():
+            raise FileNotFoundError(
+                f"{folder / name}: no folder of the camera {name!r}, which {NAME} names: "
+                "restore it, or take the camera out"
+            )
+        found[name] = find_frames(folder / name / "depth", images.DEPTHS)
+    # all are numbered alike: from the least number of an image of any camera
+    least = min((int(f.keys[0]) for f in found.values() if f.stamps is None), default=0)
+    found = {name: numbered_from(frames, least) for name, frames in found.items()}
+    own = {
+        name: _shots(folder / name, camera, coloured and not camera.masks, found[name])
+        for name, camera in rig.cameras.items()
+    }
+    clocks = {
+        n: times_of(folder / n, frames, rig.frame_rate or rate) for n, frames in found.items()
+    }
+    try:
+        paired = pair(clocks, rig.pair_tolerance)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from error
+    has_times = any(f.stamps is not None or has_table(folder / n) for n, f in found.items())
+    numbers = [
+        place if has_times else min(found[name].numbers[i] for name, i in chosen.items())
+        for place, (_, chosen) in enumerate(paired)
+    ]
+    shots = [{name: own[name][i] for name, i in chosen.items()} for _, chosen in paired]
+    return Images(np.array([time for time, _ in paired]), numbers, shots)
+
+
 def rgbd_recording(
     folder: Path | str,
     info: RecordingInfo,
@@ -133,26 +193,58 @@ def rgbd_recording(
     (force, markers) and errors are as in `make_recording`; errors also as in `stream`.
     """
     rig, segmenter = rig or read_rig(folder), None
-    if rig.segmentation is not None:
-        path = np.asarray(gripper_path, float)
-        knots = np.asarray(gripper_times, float) - info.time_offset
-        what = rig.segmentation, info.sheet, info.table_height, path, knots, str(folder)
-        segmenter = Segmenter(*what, frames_used=info.frames_used)
+    how, path = rig.segmentation, np.asarray(gripper_path, float)
+    path = path[:, None] if path.ndim == 2 else path
+    knots = np.asarray(gripper_times, float) - info.time_offset  # on the clock of the cameras
+    found = find_images(folder, rig, coloured=how is not None and how.colour is not None)
+    if how is not None:
+        what = how, info.sheet, info.table_height, path, knots, str(folder)
+        segmenter = Segmenter(*what, used=between(found.times, info.frames_used))
     alone: list[dict[str, np.ndarray]] = []
-    times, clouds = read_clouds(folder, rig, segmenter=segmenter, alone=alone)
-    path = np.asarray(gripper_path, float)
-    knots, path = np.asarray(gripper_times, float), path[:, None] if path.ndim == 2 else path
-    at_rest = is_at_rest(float(times[0]) + info.time_offset, knots, path)
-    fits = fit_cameras(rig.cameras, alone, info.sheet, at_rest=at_rest)
-    info = replace(info, camera_fits=fits)
+    times, clouds = read_clouds(folder, rig, found, segmenter=segmenter, alone=alone)
+    still = (times <= first_motion(knots, path).shown).tolist()
+    info = with_cameras(info, rig, alone, np.isin(found.times, times), still)
     clock = times + info.time_offset
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
+
+
+def between(times: Float[np.ndarray, " frame"], used: tuple[int, int]) -> tuple[float, float]:
+    """The times [s] of the first and the last frame that count."""
+    first, last = np.clip(used, 0, len(times) - 1)
+    return float(times[first]), float(times[last])
+
+
+def with_cameras(
+    info: RecordingInfo,
+    rig: Rig,
+    alone: Sequence[Mapping[str, Float[np.ndarray, "_ 3"]]],
+    kept: Bool[np.ndarray, " image"],
+    still: Sequence[bool],
+    to_world: Callable[[np.ndarray], np.ndarray] = np.asarray,
+) -> RecordingInfo:
+    """What a recording is of, with how each camera fits, and, of known `views`, who took a frame.
+
+    - `alone`: what each camera sees of each frame (`read_clouds`); `to_world` moves it, [m].
+    - `kept`: which of the frames in the folder these are. `still`: in which the sheet is at rest.
+    """
+    views, names = info.views, list(rig.cameras)
+    taken = tuple(tuple(map(names.index, each)) for each in alone)
+    if views is not None and any(len(each) < len(names) for each in taken):
+        if len(views.cameras) != len(names):
+            raise ValueError(
+                f"recording {info.name}: its cameras are out of phase: its views must have those "
+                f"of {NAME}, {', '.join(names)}, in this order"
+            )
+        views = replace(views, taken=taken)
+    fits = fit_cameras(rig.cameras, alone, info.sheet, to_world, still)
+    used = places_of(Path(info.name), info.frames_used, np.flatnonzero(kept).tolist())
+    return replace(info, camera_fits=fits, views=views, frames_used=used)
 
 
 def read_clouds(
     folder: Path | str,
     rig: Rig,
-    frame_rate: float = 0.0,
+    found: Images | None = None,
     watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
     segmenter: Segmenter | None = None,
     alone: list[dict[str, Float[np.ndarray, "_ 3"]]] | None = None,
@@ -162,84 +254,60 @@ def read_clouds(
     Frames come through `watch`, such as a bar that shows progress. What each camera sees alone,
     thinned, is appended to `alone`, frame by frame.
     """
-    frames = list(watch(stream(folder, rig, frame_rate, segmenter, alone)))
+    frames = list(watch(stream(folder, rig, found, segmenter, alone)))
     return np.array([time for time, _ in frames]), [cloud for _, cloud in frames]
 
 
 def stream(
     folder: Path | str,
     rig: Rig,
-    frame_rate: float = 0.0,
+    found: Images | None = None,
     segmenter: Segmenter | None = None,
     alone: list[Any] | None = None,
 ) -> Iterator[tuple[float, Float[np.ndarray, "point 3"]]]:
     """Time [s] and cleaned cloud [m] of one frame after the other: the images of one are in memory.
 
-    `frame_rate` [Hz] is used where the rig has none. A `segmenter` cuts the cloth out of what
-    cameras without masks see, and is checked after the last frame. Raises FileNotFoundError,
-    ImportError (names the extra), or ValueError that names the file or camera and frame, and what
-    to do.
+    `found`: the images, where they are known. A `segmenter` cuts the cloth out of what cameras
+    without masks see, and is checked after the last frame. Frames of cameras that `may_miss` the
+    fabric, and do, are left out with a warning. Raises FileNotFoundError, ImportError (names the
+    extra), or ValueError that names the file or camera and frame, and what to do.
     """
     folder = Path(folder)
     masked = all(camera.masks for camera in rig.cameras.values())
     if rig.segmentation is not None and segmenter is None and not masked:
         raise ValueError(f"{folder}: a segmentation needs sheet and grippers: use rgbd_recording")
-    coloured = bool(segmenter and segmenter.how.colour)
-    first = _first_number(folder, rig)
-    files = {
-        name: _files(folder / name, camera, coloured and not camera.masks, first)
-        for name, camera in rig.cameras.items()
-    }
-    depths = {name: frames for name, (frames, _, _) in files.items()}
+    if found is None:
+        found = find_images(folder, rig, coloured=bool(segmenter and segmenter.how.colour))
     last: dict[str, bytes] = {}
-    is_compared = False
+    is_compared, missed = False, []
     for name, camera in rig.cameras.items():
         _check_lens(name, camera)
-    for frame, (time, chosen) in enumerate(_paired(folder, rig, depths, frame_rate)):
-        parts = {}
-        for name, i in chosen.items():
-            frames, masks, colours = files[name]
-            parts[name] = _camera_cloud(rig, name, frames.files[i], masks[i], colours[i], last)
+    for frame, (time, shots) in enumerate(zip(found.times, found.shots, strict=True)):
+        parts = {name: _camera_cloud(rig, name, shot, last) for name, shot in shots.items()}
         by_camera = {name: part.points for name, part in parts.items()}
         if not is_compared and len(parts) > 1:
             is_compared = True
             _check_swapped(folder, rig, by_camera)
-        if alone is not None:
-            alone.append({name: voxel_means(part, THINNED) for name, part in by_camera.items()})
-        points = _cloth(list(parts.values()), time, segmenter)
+        points = _cloth(rig, parts, float(time), segmenter)
         cloud = clean(points, rig.clean, frame)
         if len(cloud) == 0:
+            if all(rig.cameras[name].may_miss for name in shots):
+                missed.append(frame)
+                continue
             raise ValueError(
                 f"{folder}: frame {frame} at {time:g} s: no point is left in the workspace "
                 f"{rig.clean.workspace} [m]: check workspace, table and masks, or drop the frame"
             )
-        yield time, cloud
+        if alone is not None:
+            alone.append({name: voxel_means(part, THINNED) for name, part in by_camera.items()})
+        yield float(time), cloud
+    if missed:
+        words = f"{folder}: {len(missed)} of {len(found.times)} frames show no fabric"
+        if len(missed) == len(found.times):
+            raise ValueError(f"{words}: check masks, workspace and may_miss")
+        warnings.warn(f"{words}, the first is {missed[0]}: left out", stacklevel=2)
     if segmenter is not None:
         segmenter.check()
-
-
-def frame_times(folder: Path | str, rig: Rig, frame_rate: float = 0.0) -> np.ndarray:
-    """The times [s] of the frames of all cameras, as `stream` gives them."""
-    first = _first_number(Path(folder), rig)
-    depths = {n: find_frames(Path(folder) / n / "depth", images.DEPTHS, first) for n in rig.cameras}
-    return np.array([time for time, _ in _paired(Path(folder), rig, depths, frame_rate)])
-
-
-def _first_number(folder: Path, rig: Rig) -> int | None:
-    """The least number of an image of any camera: all are numbered alike; None: they have times."""
-    folders = [folder / name / "depth" for name in rig.cameras]
-    frames = [find_frames(each, images.DEPTHS) for each in folders if each.is_dir()]
-    numbers = [int(each.keys[0]) for each in frames if each.stamps is None]
-    return min(numbers, default=None)
-
-
-def _paired(folder: Path, rig: Rig, depths: Mapping[str, Frames], frame_rate: float):
-    rate = rig.frame_rate or frame_rate
-    times = {name: times_of(folder / name, frames, rate) for name, frames in depths.items()}
-    try:
-        return pair(times, rig.pair_tolerance)
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from error
 
 
 def _check_lens(name: str, camera: DepthCamera) -> None:
@@ -261,65 +329,58 @@ class _Seen(NamedTuple):
     masked: bool
 
 
-def _cloth(seen: list[_Seen], time: float, segmenter: Segmenter | None) -> np.ndarray:
+def _cloth(
+    rig: Rig, seen: Mapping[str, _Seen], time: float, segmenter: Segmenter | None
+) -> np.ndarray:
     """The points of the cloth: all behind masks, and what a segmenter keeps of the others."""
-    points = [part.points for part in seen if part.masked or segmenter is None]
-    whole = [part for part in seen if not part.masked]
+    points = [part.points for part in seen.values() if part.masked or segmenter is None]
+    whole = {name: part for name, part in seen.items() if not part.masked}
     if segmenter is not None and whole:
-        scene, colours = (np.concatenate([part[i] for part in whole]) for i in (0, 1))
-        outside = sum(part.outside for part in whole)
-        points.append(scene[segmenter(scene, time, colours, outside)])
+        parts = list(whole.values())
+        scene, colours = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        outside = sum(part.outside for part in parts)
+        may_miss = all(rig.cameras[name].may_miss for name in whole)
+        points.append(scene[segmenter(scene, time, colours, outside, may_miss)])
     return np.concatenate(points)
 
 
-def _files(
-    folder: Path, camera: DepthCamera, coloured: bool, first: int | None
-) -> tuple[Frames, list[File], list[File]]:
+def _shots(folder: Path, camera: DepthCamera, coloured: bool, depths: Frames) -> list[Shot]:
     """The depth images of a camera, the mask of each, and the colour image if it is read."""
-    if not folder.is_dir():
-        raise FileNotFoundError(
-            f"{folder}: no folder of the camera {folder.name!r}, which {NAME} names: "
-            "restore it, or take the camera out"
-        )
-    depths = find_frames(folder / "depth", images.DEPTHS, first)
-    masks: list[File] = [None] * len(depths.files)
+    masks: Sequence[File] = [None] * len(depths.files)
     if camera.masks:
         if not (folder / "masks").is_dir():
             raise FileNotFoundError(
                 f"{folder / 'masks'}: no such folder: segment the fabric (SAM 2 writes such "
                 f'masks), or set "masks": false and give a segmentation in {NAME}'
             )
-        masks = list(_same_frames(folder, "masks", depths, images.MASKS))
-    colours: list[File] = [None] * len(depths.files)
-    if (folder / "colour").is_dir() or coloured:
-        read = _same_frames(folder, "colour", depths, images.COLOURS)
-        colours = list(read) if coloured else colours
-    return depths, masks, colours
+        masks = _same_frames(folder, "masks", depths, images.MASKS)
+    colours: Sequence[File] = [None] * len(depths.files)
+    if coloured:
+        colours = _same_frames(folder, "colour", depths, images.COLOURS)
+    return [Shot(*files) for files in zip(depths.files, masks, colours, strict=True)]
 
 
 def _same_frames(folder: Path, kind: str, depths: Frames, suffixes: Collection[str]) -> list[Path]:
-    """The images of a kind that belong to depth images, by the numbers or times in their names."""
-    others = find_frames(folder / kind, suffixes)
-    one, other = (dict(zip(each.keys, each.files, strict=True)) for each in (depths, others))
-    for key in sorted(one.keys() ^ other.keys()):
-        lacking, path = (kind, one[key]) if key in one else ("depth", other[key])
+    """The images of a kind that belong to depth images: of the same numbers in their names, or the
+    nearest times, to `ROUNDED` or a tenth of the shortest interval."""
+    others, tolerance = find_frames(folder / kind, suffixes), 0.0
+    if depths.stamps is not None:
+        tolerance = min(ROUNDED, float(np.diff(depths.stamps).min(initial=1.0)) / 10)
+    apart = np.abs(np.subtract.outer(depths.keys, others.keys))
+    nearest = apart.argmin(axis=1)
+    lacking = [depths.files[i] for i in np.flatnonzero(apart.min(axis=1) > tolerance)]
+    left = [path for i, path in enumerate(others.files) if i not in set(nearest.tolist())]
+    for where, path in [*((kind, path) for path in lacking), *(("depth", path) for path in left)]:
         raise ValueError(
-            f"{folder / lacking}: no image that belongs to {path}: export it again, or drop the "
+            f"{folder / where}: no image that belongs to {path}: export it again, or drop the "
             f"frame; depth and {kind} have the same numbers, or times, in their names"
         )
-    return [other[key] for key in one]
+    return [others.files[i] for i in nearest]
 
 
-def _camera_cloud(
-    rig: Rig,
-    name: str,
-    depth_file: Path,
-    mask_file: File,
-    colour_file: File,
-    last: dict[str, bytes],
-) -> _Seen:
+def _camera_cloud(rig: Rig, name: str, shot: Shot, last: dict[str, bytes]) -> _Seen:
     """World points [m] of the fabric, or without a mask of all, that a camera sees in a frame."""
-    camera = rig.cameras[name]
+    camera, (depth_file, mask_file, colour_file) = rig.cameras[name], shot
     depth = images.read_depth(depth_file, camera.depth_scale, camera.resolution)
     _warn_of_repeats(name, depth_file, depth, last)
     if camera.depth_along == "ray":
@@ -332,10 +393,11 @@ def _camera_cloud(
     seen = back_project(camera, depth, where)
     points = moved(np.array(camera.to_world), seen)
     kept = inside(points, rig.clean)
-    least = MOST if mask_file is not None else 0
-    if len(points) and (not kept.any() or kept.mean() < least):
+    # of what a mask marks most; without one a point, where the fabric must be seen
+    most, least = kept.mean() if len(points) else 1.0, 0.0 if camera.may_miss else 1e-9
+    if most < (MOST if mask_file is not None else least):
         raise ValueError(
-            f"{depth_file}: {kept.mean():.0%} of {len(points)} points of {name!r} are in the "
+            f"{depth_file}: {most:.0%} of {len(points)} points of {name!r} are in the "
             f"workspace {rig.clean.workspace} [m], their median is at "
             f"{np.median(points, axis=0).round(3).tolist()} m: {_remedy(rig, name, seen)}"
         )

@@ -123,7 +123,7 @@ class Segmenter:
     - `gripper_path` [m], `gripper_times` [s]: as in `make_recording`, on the clock of the frames.
     - `to_world`: from the points as they are given to the world, [m].
     - `where`: the recording, for errors.
-    - `frames_used`: the first and the last that must show a sheet; None: all.
+    - `used`: from when until when frames must show a sheet, [s]; None: all.
     - `table`: its plane, once it is fitted: normal, up, and minus the distance from 0 [m].
     """
 
@@ -134,24 +134,32 @@ class Segmenter:
     gripper_times: Float[np.ndarray, " knot"]
     where: str
     to_world: Callable[[np.ndarray], np.ndarray] = np.asarray
-    frames_used: tuple[int, int] | None = None
+    used: tuple[float, float] | None = None
     frames: list[FrameCuts] = field(default_factory=list)
     table: Float[np.ndarray, "4"] | None = None
 
     def __call__(
-        self, points: Points, time: float, colours: Colours | tuple[()] = (), outside: int = 0
+        self,
+        points: Points,
+        time: float,
+        colours: Colours | tuple[()] = (),
+        outside: int = 0,
+        may_miss: bool = False,
     ) -> Which:
         """Which points of the next frame are of the cloth; `outside` others were dropped before.
 
-        Raises ValueError that names it where none is, or a cut cannot be made.
+        Raises ValueError that names it where none is, unless it `may_miss` the cloth, or a cut
+        cannot be made.
         """
         where = f"{self.where}: frame {len(self.frames)} at {time:g} s"
         try:
-            return self._cut(points, time, colours, outside)
+            return self._cut(points, time, colours, outside, may_miss)
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from error
 
-    def _cut(self, points: Points, time: float, colours: Any, outside: int) -> Which:
+    def _cut(
+        self, points: Points, time: float, colours: Any, outside: int, may_miss: bool
+    ) -> Which:
         world, path = self.to_world(points), (self.gripper_times, self.gripper_path)
         grippers = interpolated(np.array([time]), *path).reshape(-1, 3)
         fates = np.full(len(points), len(FATES) - 1)
@@ -159,13 +167,15 @@ class Segmenter:
             fates[(fates == len(FATES) - 1) & is_cut] = FATES.index(fate)
         left = np.flatnonzero(fates == len(FATES) - 1)
         held = held_piece(world[left], grippers, self.how)
-        if held.any() or self._is_used(len(self.frames)):
+        if held.any() or self._is_used(time):
             fates[left[~held]] = FATES.index("other pieces")
         counts = np.bincount(fates, minlength=len(FATES))
         counts[0] += outside
         some = np.random.default_rng(0).permutation(len(points))[:DRAWN]
         drawn = world[some], fates[some], grippers
         is_cloth = fates == len(FATES) - 1
+        if may_miss and not is_cloth.any():
+            return is_cloth
         extent = _extent(world[is_cloth], grippers, self.sheet) if is_cloth.any() else (0.0, 0.0)
         self.frames.append(FrameCuts(time, counts, *drawn, *extent))
         if not is_cloth.any():
@@ -177,9 +187,8 @@ class Segmenter:
             )
         return is_cloth
 
-    def _is_used(self, frame: int) -> bool:
-        first, last = self.frames_used or (0, frame)
-        return first <= frame <= last
+    def _is_used(self, time: float) -> bool:
+        return self.used is None or self.used[0] <= time <= self.used[1]
 
     def _cuts(self, world: Points, colours: Any, grippers: Grippers) -> Iterator[tuple[str, Which]]:
         """Which points each cut takes."""
@@ -214,7 +223,7 @@ class Segmenter:
 
     def check(self) -> None:
         """Raise ValueError where what was left of a frame is no sheet of the stated size."""
-        used = [(n, frame) for n, frame in enumerate(self.frames) if self._is_used(n)]
+        used = [(n, frame) for n, frame in enumerate(self.frames) if self._is_used(frame.time)]
         few = np.mean([frame.area < LEAST_AREA for _, frame in used] or [0]) <= FEW
         for number, frame in used:
             remedy = "narrow the workspace, give the colour, gripper_radius, arms, a smaller link"

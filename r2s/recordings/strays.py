@@ -20,6 +20,7 @@ from r2s.recordings.recording import (
     corner,
     gripper_positions,
 )
+from r2s.recordings.views import taken_by
 
 Masks = Mapping[str, Bool[np.ndarray, "frame point"]]
 
@@ -36,7 +37,7 @@ KINDS = {
 def strays(recording: Recording) -> Masks:
     """Which points are no measurement of the sheet, by `KINDS`; none where they are markers.
 
-    Many at exactly one place, such as the camera itself; behind every camera of `views`; too far
+    Many at exactly one place, such as the camera itself; behind every camera that took it; too far
     from a gripper (not of stretchings: knits are pulled to twice their length).
     """
     mask, info = np.asarray(recording.mask), recording.info
@@ -48,7 +49,8 @@ def strays(recording: Recording) -> Masks:
         points = np.asarray(recording.points[frame], np.float64)[seen]
         repeats[frame, seen] = at_one_place(points)
         if info.views:
-            depths = [from_world(camera, points)[:, 2] for camera in info.views.cameras]
+            cameras = [info.views.cameras[i] for i in taken_by(info.views, frame)]
+            depths = [from_world(camera, points)[:, 2] for camera in cameras]
             behind[frame, seen] = np.max(depths, axis=0) <= 0
         if info.scenario != "stretching":
             away = np.linalg.norm(points[:, None] - places, axis=-1)

@@ -88,18 +88,22 @@ class Views:
     - `border`: width of the strip, along the borders of the sheet and of the workspace, which the
       outlier filter erodes and in which nothing is asked of a cloud, [m].
     - `hidden`: distance from a gripper within which the robot's mask hides the sheet, [m].
+    - `taken`: of each frame the numbers of the cameras that took it; empty: all took all.
     """
 
     cameras: tuple[DepthCamera, ...]
     clean: Cleaning
     border: float = 0.0
     hidden: float = 0.0
+    taken: tuple[tuple[int, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.cameras:
             raise ValueError("views need a camera, found none")
         if min(self.border, self.hidden) < 0:
             raise ValueError(f"border and hidden must not be negative, found {self}")
+        if any(not 0 <= i < len(self.cameras) for frame in self.taken for i in frame):
+            raise ValueError(f"taken: there are {len(self.cameras)} cameras, from 0")
         low, high = np.array(self.clean.workspace)
         if not (low + 2 * self.border < high).all():
             raise ValueError(
@@ -137,12 +141,19 @@ def shifted(views: Views, shift: Corner) -> Views:
     return replace(views, cameras=tuple(cameras), clean=replace(views.clean, workspace=corners))
 
 
+def taken_by(views: Views, frame: int) -> list[int]:
+    """The numbers of the cameras that took a frame."""
+    return list(views.taken[frame] if views.taken else range(len(views.cameras)))
+
+
 def in_view(
     views: Views,
     samples: Float[Array, "sample 3"],
     grippers: Float[Array, "gripper 3"],
+    taken: Bool[Array, " camera"] | None = None,
 ) -> Bool[Array, " sample"]:
-    """Which samples [m] of a surface some camera must have recorded.
+    """Which samples [m] of a surface some camera of those that have `taken` the frame (None: all)
+    must have recorded.
 
     In view, in the workspace less its border, away from the `grippers` [m], and not behind others:
     a z-buffer whose cells are `CELL` wide where the sheet is, so samples must be closer than that.
@@ -152,8 +163,10 @@ def in_view(
     kept = jnp.all((samples > low) & (samples < high), axis=1)
     apart = jnp.linalg.norm(samples[:, None] - grippers[None], axis=-1)
     kept &= jnp.all(apart > views.hidden, axis=1)
-    by_camera = [_unhidden(camera, samples) for camera in views.cameras]
-    return kept & jnp.any(jnp.stack(by_camera), axis=0)
+    by_camera = jnp.stack([_unhidden(camera, samples) for camera in views.cameras])
+    if taken is not None:
+        by_camera &= taken[:, None]
+    return kept & jnp.any(by_camera, axis=0)
 
 
 def _unhidden(camera: DepthCamera, samples: Float[Array, "sample 3"]) -> Bool[Array, " sample"]:
@@ -182,12 +195,12 @@ def _cells(camera: DepthCamera) -> int:
 
 
 def observed(
-    views: Views, x: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
+    views: Views, x: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"], frame: int = 0
 ) -> Float[np.ndarray, "point 3"]:
-    """The points [m] that the cameras would have recorded of a mesh [m]: every pixel that sees it,
-    cleaned camera by camera as the recording was. Without a robot."""
+    """The points [m] that the cameras would have recorded of a mesh [m] in a frame: every pixel of
+    those that took it that sees the mesh, cleaned as the recording was. Without a robot."""
     clouds = []
-    for camera in views.cameras:
+    for camera in (views.cameras[i] for i in taken_by(views, frame)):
         depth, _ = render(camera, x, faces)
         points = moved(np.array(camera.to_world), back_project(camera, depth, depth > 0))
         clouds.append(clean(points, views.clean, 0))

@@ -19,7 +19,7 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import TurnedMembrane
 from r2s.mesh.mesh import Mesh, corner, rectangle
 from r2s.mesh.mesh import resized as resized_mesh
-from r2s.recordings.recording import Recording, SheetPlacement, interpolated
+from r2s.recordings.recording import Recording, SheetPlacement, first_motion, interpolated
 from r2s.scenarios.paths import Route, ease
 from r2s.scenarios.sheet_solver import Braked, SheetSolver
 from r2s.solvers.implicit.cloth import MAX_ITERATIONS, ImplicitCloth, prepare_mesh
@@ -29,7 +29,6 @@ CLEARANCE = 1e-3  # [m], between the table and a sheet that lies on it
 LEAD_IN = 0.5  # [s], in which the grippers go from the sheet at rest to where their path begins
 GRID = 0.0125  # [s], at least a step: between the states that frames at uneven times lie between
 EVEN = 1e-3  # of the interval, by which frames may deviate from even times
-STILL = 1e-4  # [m], within which a gripper has not moved yet
 MAX_STEP = 0.025  # [s]: 1 mm from the limit of small steps in a lift of 2.5 s, by measurement
 SETTLING = 3.0  # [s], in which a sheet that hangs comes to rest before the first frame
 BRAKE = 8.0  # [1/s], mass damping meanwhile: of a sheet of 0.45 m 4e-11 of the energy remain
@@ -221,14 +220,17 @@ def _at_rest(
 
 def _from_rest(route: Route, first: float) -> tuple[float, Route]:
     """When the sheet is last at rest, [s]: at the first frame, at time `first`, or where a gripper
-    moves before that; and the route from there on."""
-    moved = np.linalg.norm(route.path - route.path[0], axis=-1).max(axis=-1) > STILL
-    start = min(route.times[max(int(moved.argmax()) - 1, 0)], first) if moved.any() else first
-    if not route.times[0] < start:
-        return start, route
-    left = route.times > start
-    here = interpolated(np.array([start]), route.times, route.path)
-    return start, Route(np.r_[start, route.times[left]], np.concatenate([here, route.path[left]]))
+    begins to move before that; and the route from there on, without jitter before it moves."""
+    begin = first_motion(*route).begin
+    start, (times, path) = min(begin, first), route
+    if np.isfinite(begin):
+        still = interpolated(np.array([begin]), times, path)
+        path = np.where((times < begin)[:, None, None], still, path)
+    if not times[0] < start:
+        return start, Route(times, path)
+    left = times > start
+    here = interpolated(np.array([start]), times, path)
+    return start, Route(np.r_[start, times[left]], np.concatenate([here, path[left]]))
 
 
 def _interval(times: Float[np.ndarray, " frame"]) -> tuple[float, bool]:

@@ -314,9 +314,10 @@ def find_recordings(folder: Path) -> list[GivenRecording]:
     recordings = []
     for name in manifest.read_recordings(folder, rules):
         digest = sha256()
-        for file in manifest.sources(folder, rules, name):
+        found = manifest.find(folder, rules, name)
+        for file in manifest.sources(found):
             digest.update(file.read_bytes())
-        info = manifest.read_recording(folder, rules, name).info
+        info = manifest.read_recording(folder, rules, name, found=found).info
         scenario = SAME_SCENARIO.get(info.scenario, info.scenario)
         place = (info.fabric, scenario, info.trial, str(folder), name)
         recordings.append(GivenRecording(*place, digest.hexdigest()))

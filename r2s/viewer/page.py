@@ -20,7 +20,7 @@ from r2s.estimation.problem import Clouds
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 from r2s.metrics.losses import masked_mean, surface_residuals
-from r2s.recordings.recording import Recording, subsample
+from r2s.recordings.recording import Recording, lasts, subsample
 from r2s.scenarios import Experiment
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
 from r2s.solvers.simulate import Solution
@@ -186,8 +186,8 @@ class Page:
             event.client.add_notification(title, text)
 
     def _run(self) -> None:
-        scenario = self.subject.scenario
-        interval = scenario.interval * float(np.diff(np.asarray(scenario.places)).mean())
+        # how long each frame is shown: until the next, the last as long as most of them
+        lasting = lasts(np.asarray(self.moved.motion.times, np.float64))
         due = time.monotonic()
         while not self._stop.is_set():
             if self._changed.is_set():
@@ -200,10 +200,10 @@ class Page:
                 self.u = u
                 self._draw()
             if self._play.value and time.monotonic() >= due:
-                due = time.monotonic() + interval
-                frames = len(self.moved.motion.ok)
-                self._frame.value = (self._frame.value + 1) % frames  # draws it
-            time.sleep(min(PAUSE, interval))
+                frame = (self._frame.value + 1) % len(lasting)
+                due = max(due, time.monotonic() - PAUSE) + lasting[frame]
+                self._frame.value = frame  # draws it
+            time.sleep(min(PAUSE, lasting.min()))
 
     def _draw(self) -> None:
         """Draw the frame of the slider."""

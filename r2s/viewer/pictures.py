@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from r2s._util.extras import require
 from r2s._util.files import write_bytes
 from r2s.recordings.open import SimulatedCloth
-from r2s.recordings.recording import Recording, SheetPlacement, cloud, corner
+from r2s.recordings.recording import Recording, SheetPlacement, cloud, corner, lasts
 
 # The object API alone: pyplot would keep every figure, and choose a backend for the caller.
 require("matplotlib", "study", "pictures")
@@ -35,6 +35,7 @@ MAX_DOTS = 1500  # a panel; more would hide the cloth
 MAX_PANELS = 12  # of the contact sheet
 ELEVATION, FLAT_ELEVATION, AZIMUTH = 18, 50, -60  # [degrees], of the eye; the second: flat scenes
 FLAT = 0.3  # least height of the box over its longest side, so that a flat scene can be seen in
+EVEN, TICKS = 0.05, 4  # of an interval, to which frames are even; pictures of an MP4 else
 STRIP = 1.7  # [inch], height of the force's curve
 Video = Literal["auto", "gif", "mp4", "none"]
 Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]
@@ -65,10 +66,9 @@ def show(
     if video == "auto":
         video = "gif" if importlib.util.find_spec("cv2") is None else "mp4"
     if video != "none":
-        times, path = np.asarray(recording.times, float), folder / f"{stem}.{video}"
-        interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+        path, lasting = folder / f"{stem}.{video}", lasts(np.asarray(recording.times, np.float64))
         write = write_mp4 if video == "mp4" else write_gif
-        write(path, pictures(recording, cloth), interval)
+        write(path, pictures(recording, cloth), lasting)
         written.append(path)
     return written
 
@@ -265,8 +265,8 @@ def draw_title_and_legend(figure: Any, content: Content) -> None:
     figure.legend(handles=handles, **options)
 
 
-def write_gif(path: Path, frames: Pictures, interval: float) -> None:
-    """Write pictures, one each `interval` [s], as a GIF, of up to 50 a second."""
+def write_gif(path: Path, frames: Pictures, lasting: Float[np.ndarray, " frame"]) -> None:
+    """Write pictures, each `lasting` so long [s], as a GIF, of up to 50 a second."""
     from PIL import Image  # comes with matplotlib
 
     images = [Image.fromarray(pixels) for pixels in frames]
@@ -274,7 +274,7 @@ def write_gif(path: Path, frames: Pictures, interval: float) -> None:
     palette = images[len(images) // 2].quantize(64)
     first, *others = (i.quantize(palette=palette, dither=Image.Dither.NONE) for i in images)
     # GIFs count in hundredths of a second: round the times, not the intervals, which would add up.
-    times = np.round(100 * interval * np.arange(len(images) + 1))
+    times = np.round(100 * np.cumsum([0, *lasting]))
     duration = [max(20, 10 * int(step)) for step in np.diff(times)]  # [ms]
     options = {"save_all": True, "append_images": others, "loop": 0, "optimize": False}
     buffer = io.BytesIO()
@@ -282,18 +282,24 @@ def write_gif(path: Path, frames: Pictures, interval: float) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def write_mp4(path: Path, frames: Pictures, interval: float) -> None:
-    """Write pictures of even sides, one each `interval` [s], as an MP4.
+def write_mp4(path: Path, frames: Pictures, lasting: Float[np.ndarray, " frame"]) -> None:
+    """Write pictures of even sides, each `lasting` so long [s], as an MP4.
 
-    Needs OpenCV: pip install 'r2s[camera]'. Raises OSError where it cannot write MP4.
+    Its rate is even: that of the frames, or, where they are not, `TICKS` times that of the most
+    frequent interval, at which pictures are repeated. Needs OpenCV: pip install 'r2s[camera]'. Raises OSError where it cannot write MP4.
     """
     cv2 = require("cv2", "camera", "videos as MP4 (a GIF needs no extra)")
+    usual = float(np.median(lasting))
+    is_even = np.abs(lasting - usual).max() < EVEN * usual
+    tick = usual / (1 if is_even else TICKS)
+    repeats = np.diff(np.round(np.cumsum([0, *lasting]) / tick)).astype(int)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         part, writer = Path(folder) / "video.mp4", cv2.VideoWriter()
-        for pixels in frames:
+        for pixels, count in zip(frames, repeats, strict=True):
             code, size = cv2.VideoWriter.fourcc(*"mp4v"), pixels.shape[1::-1]
-            if not writer.isOpened() and not writer.open(str(part), code, 1 / interval, size):
+            if not writer.isOpened() and not writer.open(str(part), code, 1 / tick, size):
                 raise OSError(f"{path}: OpenCV cannot write MP4 here: ask for a GIF")
-            writer.write(np.ascontiguousarray(pixels[..., ::-1]))
+            for _ in range(count):
+                writer.write(np.ascontiguousarray(pixels[..., ::-1]))
         writer.release()
         write_bytes(path, part.read_bytes())

@@ -81,11 +81,6 @@ def swap(cameras: dict) -> dict:
     return {name: camera | {"to_world": pose} for (name, camera), pose in pairs}
 
 
-def one_colour(folder: Path) -> None:
-    (folder / "right/colour").mkdir()
-    (folder / "right/colour/1.png").touch()
-
-
 def duplicate(folder: Path) -> None:
     shutil.copy(folder / "left/depth/001.png", folder / "left/depth/left_0001.png")
 
@@ -116,7 +111,6 @@ BROKEN: list[tuple[Break, str]] = [
         removed("right/masks/003.png"),
         "right/masks: no image .*depth/003.png: export it",
     ),
-    (one_colour, "right/colour: no image that belongs to .*depth/000.png"),
     (duplicate, "left/depth: frame 1 is there twice: .*keep one"),
     # images
     (cut("left/depth/002.png"), "left/depth/002.png: truncated PNG.*again"),

@@ -203,6 +203,21 @@ def test_a_sheet_of_which_no_point_lies_on_the_table_is_not_shown_and_no_warning
     assert np.isnan(shown).all()
 
 
+@pytest.mark.parametrize("markers", [1, 2])
+def test_points_far_apart_and_single_markers_are_not_shown_and_no_warning(markers):
+    hangs = dataclasses.replace(PLACE, weft=(0.0, 0.0, -1.0))
+    clouds, path = [0.2 * np.eye(3)] * 7, np.zeros((7, 1, 3))
+    places = np.full((7, markers, 3), 0.1)
+    places[0, 0] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        made = made_up(clouds, TIMES[:7], path, TIMES[:7], sheet=hangs)
+        marked = make_recording(clouds, TIMES[:7], path, TIMES[:7], made.info, markers=places)
+        found = {f.check: f for each in (made, marked) for f in check(each)}
+    assert found["gravity"].describe().startswith("not shown   gravity: ")
+    assert found["markers"].describe().startswith("not shown   markers: ")
+
+
 RNG = np.random.default_rng(0)
 
 

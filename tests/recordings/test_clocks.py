@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2s.recordings.clocks import find_frames, read_times, times_of
+from r2s.recordings.clocks import find_frames, places_of, read_times, times_of
 from r2s.recordings.clouds import READERS
 
 
@@ -110,3 +110,14 @@ def test_without_any_clock_the_ways_to_give_one_are_named(tmp_path):
 def test_times_may_have_titles_and_frame_numbers(tmp_path, text):
     (tmp_path / "times.csv").write_text(text, encoding="utf-8")
     np.testing.assert_allclose(read_times(tmp_path / "times.csv"), [0.1, 0.2])
+
+
+def test_frames_that_count_may_end_at_dropped_ones(tmp_path):
+    numbers = [0, 1, 3, 4, 6, 7]
+    assert places_of(tmp_path, (), numbers) == (0, 5)
+    assert places_of(tmp_path, (2, 5), numbers) == (2, 3)  # both dropped
+    with pytest.warns(UserWarning, match=r"frames_used is 1\.\.8, but .* numbered 0 to 7"):
+        assert places_of(tmp_path, (1, 8), numbers) == (1, 5)
+    for used in ((0, 40), (8, 9)):  # others than these are meant
+        with pytest.raises(ValueError, match="numbered 0 to 7, counted from the first"):
+            places_of(tmp_path, used, numbers)

@@ -18,11 +18,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from r2s.recordings.recording import (
+    STILL,
     Recording,
     RecordingInfo,
     SheetPlacement,
     cloud,
     corner,
+    first_motion,
     load,
     make_recording,
     save,
@@ -359,3 +361,18 @@ def test_no_space_leaves_the_old_file_and_no_other(
             save(record(ones(5, 6)), target)
         assert error.value.errno == errno.ENOSPC
     assert list(tmp_path.iterdir()) == [path] and path.read_bytes() == before
+
+
+KNOTS = np.arange(0, 15, 1 / 120)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 3e-5, 1.5e-4])  # [m] of each axis: up to 0.5 mm
+@pytest.mark.parametrize("speed", [1e-3, 0.2])
+def test_a_motion_begins_at_the_last_rest_however_slow_it_is(jitter: float, speed: float) -> None:
+    """After 10 s: jitter of a robot at rest is none, a slow pull is one from its begin on."""
+    path = jitter * np.random.default_rng(0).standard_normal((len(KNOTS), 1, 3))
+    path[:, 0, 2] += speed * np.clip(KNOTS - 10, 0, None)
+    begin, shown = first_motion(KNOTS, path)
+    assert 10 - 1 / 60 <= begin <= 10 + 1 / 60 + 8 * jitter / speed
+    assert shown == pytest.approx(10 + STILL / speed, abs=5 * jitter / speed + 1 / 60)
+    assert np.isinf(first_motion(KNOTS[:1000], path[:1000])).all()

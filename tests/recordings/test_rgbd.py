@@ -14,10 +14,11 @@ from rgbd_scene import INFO, PATH, TIMES, camera, distances, rig, surface, write
 from r2s._util.files import write_json
 from r2s.materials import presets
 from r2s.recordings.clouds import Cleaning, clean, inside, outliers
-from r2s.recordings.images import read_mask
+from r2s.recordings.images import encode_png, read_mask
 from r2s.recordings.recording import cloud
 from r2s.recordings.rgbd import Rig, pair, read_clouds, read_rig, rgbd_recording, stream
 from r2s.recordings.synthetic_rgbd import NONE, write_rgbd
+from r2s.recordings.views import Views
 from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import from_recording, rollout
 from r2s.scenarios.standard import SCENARIOS
@@ -88,6 +89,53 @@ def test_a_camera_that_lost_its_first_image_keeps_its_times(tmp_path: Path) -> N
         _, clouds = read_clouds(tmp_path, scene)
     for frame, points in enumerate(clouds):
         assert distances(points, surface(frame)).mean() < 2e-3
+
+
+def out_of_phase(folder: Path, scene: Rig) -> None:
+    (folder / "right" / "times.csv").write_text("".join(f"{t + 0.03}\n" for t in TIMES))
+
+
+def test_cameras_out_of_phase_are_known_frame_by_frame(tmp_path: Path) -> None:
+    scene = write(tmp_path)
+    out_of_phase(tmp_path, scene)
+    views = Views(tuple(scene.cameras.values()), scene.clean)
+    info = replace(INFO, frames_used=(0, 7), views=views)
+    made = rgbd_recording(tmp_path, info, PATH, np.arange(4) / 10)
+    assert made.info.views is not None and made.info.views.taken == ((0,), (1,)) * 4
+    one = replace(info, views=replace(views, cameras=views.cameras[:1]))
+    with pytest.raises(ValueError, match="out of phase: its views must have those of cameras.json"):
+        rgbd_recording(tmp_path, one, PATH, np.arange(4) / 10)
+
+
+def test_a_camera_out_of_phase_may_miss_the_fabric_alone(tmp_path: Path) -> None:
+    scene = write(tmp_path)
+    out_of_phase(tmp_path, scene)
+    (tmp_path / "right/masks/001.png").write_bytes(encode_png(np.zeros((120, 160), np.uint8)))
+    missing = replace(scene.cameras["right"], may_miss=True)
+    scene = replace(scene, cameras={**scene.cameras, "right": missing})
+    info = replace(INFO, frames_used=(2, 7))
+    with pytest.warns(UserWarning, match="1 of 8 frames show no fabric, the first is 3: left out"):
+        made = rgbd_recording(tmp_path, info, PATH, np.arange(4) / 10, rig=scene)
+    kept = np.delete(np.sort([*TIMES, *(TIMES + 0.03)]), 3)
+    np.testing.assert_allclose(made.times, kept, atol=1e-6)
+    assert made.info.frames_used == (2, 6)
+
+
+@pytest.mark.parametrize(("off", "fits"), [(1e-6, True), (4e-4, True), (5e-3, False)])
+def test_masks_belong_to_the_nearest_depth_image(tmp_path: Path, off: float, fits: bool) -> None:
+    """Where both have times in their names, of which one was rounded."""
+    scene = write(tmp_path)
+    for name in scene.cameras:
+        (tmp_path / name / "times.csv").unlink()
+        for kind, late in (("depth", 0.0), ("masks", off)):
+            for file, time in zip(sorted((tmp_path / name / kind).iterdir()), TIMES, strict=True):
+                file.rename(file.with_name(f"{1700000100 + time + late:.6f}.png"))
+    if fits:
+        for frame, (_, points) in enumerate(stream(tmp_path, scene)):
+            assert distances(points, surface(frame)).mean() < 2e-3
+    else:
+        with pytest.raises(ValueError, match="left/masks: no image that belongs to"):
+            next(stream(tmp_path, scene))
 
 
 def test_a_mask_may_have_a_palette(folder: Path, tmp_path: Path) -> None:

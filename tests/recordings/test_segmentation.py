@@ -189,9 +189,9 @@ def test_frames_that_hide_the_cloth_are_few() -> None:
 
 def test_frames_that_are_not_used_may_show_no_sheet() -> None:
     """Such as those in which the gripper goes away; their points are kept as far as may be."""
-    cutter = segmenter(frames_used=(0, 1))
-    for points in (POINTS, POINTS, CLOTH + [0, 0, 0.4]):
-        is_cloth = cutter(points, 0.5)
+    cutter = segmenter(used=(0.0, 0.5))
+    for time, points in ((0.4, POINTS), (0.5, POINTS), (0.6, CLOTH + [0, 0, 0.4])):
+        is_cloth = cutter(points, time)
     cutter.check()
     assert is_cloth.mean() > 0.5
     with pytest.raises(ValueError, match="no cloth is left"):

@@ -66,6 +66,20 @@ def test_two_cameras_see_what_either_sees_and_a_gripper_hides_what_is_near_it():
     np.testing.assert_array_equal(near, whole & (np.linalg.norm(both, axis=1) > 0.1))
 
 
+def test_a_frame_shows_what_the_cameras_that_took_it_see():
+    """Out of phase: one after the other."""
+    both = jnp.asarray(np.concatenate([sheet(0.1), sheet(0.0)]))
+    cameras = ABOVE, camera((0.0, 0.1, -1.0))
+    views = Views(cameras, WHOLE, taken=((0,), (1,), (0, 1)))
+    for frame, taken in enumerate(([True, False], [False, True], [True, True])):
+        alone = Views(tuple(c for c, t in zip(cameras, taken, strict=True) if t), WHOLE)
+        np.testing.assert_array_equal(
+            in_view(views, both, NOBODY, jnp.array(taken)), in_view(alone, both, NOBODY)
+        )
+        seen = [observed(each, sheet(0.0), FACES, n) for each, n in ((views, frame), (alone, 0))]
+        np.testing.assert_array_equal(*seen)
+
+
 def test_the_workspace_less_its_border_is_what_counts():
     x = jnp.asarray(sheet(0.0))
     narrow = dataclasses.replace(WHOLE, workspace=((-0.1, -1.0, -1.0), (0.1, 1.0, 1.0)))
