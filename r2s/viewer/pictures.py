@@ -286,7 +286,8 @@ def write_mp4(path: Path, frames: Pictures, lasting: Float[np.ndarray, " frame"]
     """Write pictures of even sides, each `lasting` so long [s], as an MP4.
 
     Its rate is even: that of the frames, or, where they are not, `TICKS` times that of the most
-    frequent interval, at which pictures are repeated. Needs OpenCV: pip install 'r2s[camera]'. Raises OSError where it cannot write MP4.
+    frequent interval, at which pictures are repeated. Needs OpenCV: pip install 'r2s[camera]'.
+    Raises OSError where it cannot write MP4.
     """
     cv2 = require("cv2", "camera", "videos as MP4 (a GIF needs no extra)")
     usual = float(np.median(lasting))

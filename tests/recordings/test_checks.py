@@ -206,7 +206,8 @@ def test_a_sheet_of_which_no_point_lies_on_the_table_is_not_shown_and_no_warning
 @pytest.mark.parametrize("markers", [1, 2])
 def test_points_far_apart_and_single_markers_are_not_shown_and_no_warning(markers):
     hangs = dataclasses.replace(PLACE, weft=(0.0, 0.0, -1.0))
-    clouds, path = [0.2 * np.eye(3)] * 7, np.zeros((7, 1, 3))
+    corners = 0.2 * np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3)
+    clouds, path = [corners] * 7, np.zeros((7, 1, 3))
     places = np.full((7, markers, 3), 0.1)
     places[0, 0] = np.nan
     with warnings.catch_warnings():

@@ -16,8 +16,8 @@ from r2s.recordings.open import (
     open_recording,
     save_trajectory,
 )
-from r2s.recordings.recording import save
-from r2s.viewer.pictures import _draw_force, contact_sheet, pictures, show
+from r2s.recordings.recording import lasts, save
+from r2s.viewer.pictures import _draw_force, contact_sheet, pictures, show, write_gif, write_mp4
 
 
 def colours(path: Path) -> set[tuple[int, int, int]]:
@@ -84,6 +84,25 @@ def test_a_video_of_opencv(tmp_path: Path) -> None:
     capture = cv2.VideoCapture(str(written[1]))
     assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 3
     assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(15, abs=0.01)
+
+
+def test_videos_go_by_the_frames_times(tmp_path: Path) -> None:
+    """The third of four frames was dropped."""
+    cv2 = pytest.importorskip("cv2")
+    frames = [np.full((16, 16, 3), value, np.uint8) for value in (0, 100, 200)]
+    lasting = lasts(np.array([0.0, 0.1, 0.3]))
+    np.testing.assert_allclose(lasting, [0.1, 0.2, 0.15])
+    write_gif(tmp_path / "v.gif", frames, lasting)
+    with Image.open(tmp_path / "v.gif") as video:
+        shown = []
+        for frame in range(3):
+            video.seek(frame)
+            shown.append(video.info["duration"])
+    assert shown == [100, 200, 150]  # [ms]
+    write_mp4(tmp_path / "v.mp4", frames, lasting)
+    capture = cv2.VideoCapture(str(tmp_path / "v.mp4"))
+    seconds = capture.get(cv2.CAP_PROP_FRAME_COUNT) / capture.get(cv2.CAP_PROP_FPS)
+    assert seconds == pytest.approx(0.45, abs=0.02)
 
 
 def test_a_cloth_that_flew_off_does_not_spoil_the_picture(tmp_path: Path) -> None:
