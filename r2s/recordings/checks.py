@@ -5,11 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from r2s.recordings.clouds import outliers, voxel_means
+from r2s.recordings.clouds import connected_pieces, outliers, voxel_means
 from r2s.recordings.recording import (
     CORNERS,
     Recording,
@@ -199,9 +197,7 @@ def _pieces(points: Points) -> Float[np.ndarray, "kept 3"]:
     points = points[np.asarray(near) > FEW]
     if not len(points):
         return points
-    pairs = KDTree(points).query_pairs(APART, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
-    piece = connected_components(links, directed=False)[1]
+    piece = connected_pieces(points, APART)
     return points[(np.bincount(piece) >= SCRAP * len(points))[piece]]
 
 

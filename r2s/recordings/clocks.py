@@ -76,7 +76,7 @@ def find_frames(folder: Path | str, suffixes: Collection[str], first: int | None
                 "or, if the names are times, write these to times.csv, a line a frame"
             )
     keys = sorted(frames)
-    start = keys[0] if first is None else first
+    start = int(keys[0]) if first is None else first
     if keys[0] < start:
         raise ValueError(f"{folder}: frame {keys[0]} comes before the first frame, {start}")
     return numbered_from(Frames([frames[key] for key in keys], keys, [], None), start)

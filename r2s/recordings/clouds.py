@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool, Float, Int, Num
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from r2s._util.extras import require
@@ -146,6 +148,15 @@ def draw_points(
         return points
     chosen = np.random.default_rng(seed).choice(len(points), most, replace=False)
     return points[np.sort(chosen)]
+
+
+def connected_pieces(
+    points: Float[np.ndarray, "point 3"], link: float
+) -> Int[np.ndarray, " point"]:
+    """The number of the piece of each point; points closer than `link` are of one piece."""
+    pairs = KDTree(points).query_pairs(link, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
+    return connected_components(links, directed=False)[1]
 
 
 def _read_npy(path: Path) -> np.ndarray:

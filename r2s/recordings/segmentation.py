@@ -12,13 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from r2s._util.checks import expect
 from r2s._util.extras import require
-from r2s.recordings.clouds import Corner, draw_points, read_values, voxel_means
+from r2s.recordings.clouds import Corner, connected_pieces, draw_points, read_values, voxel_means
 from r2s.recordings.recording import CORNERS, SheetPlacement, corner, interpolated
 
 FATES = ("outside", "table", "other colour", "gripper", "arm", "other pieces", "cloth")
@@ -285,13 +283,10 @@ def held_piece(points: Points, grippers: Grippers, how: Segmentation) -> Which:
     if not len(points):
         return np.zeros(0, bool)
     centres = voxel_means(points, how.link / 2)
-    tree = KDTree(centres)
-    pairs = tree.query_pairs(how.link, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(centres),) * 2)
-    piece = connected_components(links, directed=False)[1]
+    piece = connected_pieces(centres, how.link)
     away = np.linalg.norm(centres[:, None] - grippers, axis=-1).min(axis=1)
     sizes = np.bincount(piece) * (np.bincount(piece, away <= how.touch) > 0)
-    return (piece[tree.query(points)[1]] == sizes.argmax()) & (sizes.max() > 0)
+    return (piece[KDTree(centres).query(points)[1]] == sizes.argmax()) & (sizes.max() > 0)
 
 
 def _extent(points: Points, grippers: Grippers, sheet: SheetPlacement) -> tuple[float, float]:

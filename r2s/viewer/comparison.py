@@ -4,7 +4,6 @@ prior and posterior of each parameter.
 Needs matplotlib: pip install 'r2s[study]'.
 """
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from r2s._util.files import write_bytes
 from r2s.estimation.estimate import Estimate
 from r2s.materials.parameters import InformedSpace, ParameterSpace, Range
 from r2s.metrics.losses import to_surface
 from r2s.recordings.open import SimulatedCloth
 from r2s.recordings.recording import Recording, cloud
+from r2s.viewer.cuts import write_figure
 from r2s.viewer.pictures import (
     CLOTH,
     GREY,
@@ -45,7 +44,7 @@ def draw_prediction(path: Path, recording: Recording, sheets: Mapping[str, Simul
     height = PANEL * len(sheets) + 1.0
     figure = Figure(figsize=(PANEL * FRAMES, height))
     _rows_of_frames(figure, recording, sheets, top=1 - 0.5 / height, bottom=0.7 / height)
-    return _write(path, figure)
+    return write_figure(path, figure)
 
 
 def draw_estimate(
@@ -76,7 +75,7 @@ def draw_estimate(
         axes = figure.add_subplot(grid[i // COLUMNS, i % COLUMNS])
         prior = (float(mean[i]), float(prior_deviation[i])) if informed else None
         _draw_densities(axes, bound, estimate, i, prior)
-    return _write(path, figure)
+    return write_figure(path, figure)
 
 
 def _rows_of_frames(
@@ -144,10 +143,3 @@ def _normal(place: np.ndarray, mean: float, deviation: float) -> np.ndarray:
     """A normal density, scaled to an area of one over the unit interval."""
     density = np.exp(-0.5 * ((place - mean) / deviation) ** 2)
     return density / max(float(np.trapezoid(density, place)), 1e-12)
-
-
-def _write(path: Path, figure: Any) -> Path:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    write_bytes(path, buffer.getvalue())
-    return path

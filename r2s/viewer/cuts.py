@@ -36,6 +36,12 @@ def draw_cuts(path: Path, title: str, frames: Sequence[FrameCuts]) -> None:
     entries = figure.axes[0].get_legend_handles_labels()
     figure.legend(*entries, loc="lower center", ncols=8, fontsize=8, markerscale=2)
     figure.suptitle(title, fontsize=11)
+    write_figure(path, figure)
+
+
+def write_figure(path: Path, figure: Any) -> Path:
+    """Write a figure of Matplotlib as PNG, whole or not at all; its path. OSError names it."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    figure.savefig(buffer, format="png", dpi=100)
     write_bytes(path, buffer.getvalue())
+    return path

@@ -20,6 +20,7 @@ from r2s._util.extras import require
 from r2s._util.files import write_bytes
 from r2s.recordings.open import SimulatedCloth
 from r2s.recordings.recording import Recording, SheetPlacement, cloud, corner, lasts
+from r2s.viewer.cuts import write_figure
 
 # The object API alone: pyplot would keep every figure, and choose a backend for the caller.
 require("matplotlib", "study", "pictures")
@@ -78,10 +79,7 @@ def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None
     count = len(recording.times)
     frames = np.unique(np.linspace(0, count - 1, min(MAX_PANELS, count)).round().astype(int))
     figure = _drawn(Content.make(recording, cloth), frames.tolist(), (3.6, 3.3))
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    write_bytes(path, buffer.getvalue())
-    return path
+    return write_figure(path, figure)
 
 
 def pictures(recording: Recording, cloth: SimulatedCloth | None = None) -> Iterator[np.ndarray]:

@@ -15,9 +15,11 @@ from r2s.viewer.comparison import draw_estimate, draw_prediction
 @pytest.fixture
 def figures(monkeypatch):
     """The figures that are drawn; they are written, too."""
-    drawn, write = [], comparison._write
+    drawn, write = [], comparison.write_figure
     monkeypatch.setattr(
-        comparison, "_write", lambda path, figure: (drawn.append(figure), write(path, figure))[1]
+        comparison,
+        "write_figure",
+        lambda path, figure: (drawn.append(figure), write(path, figure))[1],
     )
     return drawn
 

@@ -89,7 +89,8 @@ def test_a_video_of_opencv(tmp_path: Path) -> None:
 def test_videos_go_by_the_frames_times(tmp_path: Path) -> None:
     """The third of four frames was dropped."""
     cv2 = pytest.importorskip("cv2")
-    frames = [np.full((16, 16, 3), value, np.uint8) for value in (0, 100, 200)]
+    grey = np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, axis=2)
+    frames = [np.roll(grey, 5 * n, axis=0) for n in range(3)]
     lasting = lasts(np.array([0.0, 0.1, 0.3]))
     np.testing.assert_allclose(lasting, [0.1, 0.2, 0.15])
     write_gif(tmp_path / "v.gif", frames, lasting)
