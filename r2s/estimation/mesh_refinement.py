@@ -23,7 +23,7 @@ from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import FINEST, MARGIN, Descent, loss_from
 from r2s.estimation.judgement import with_uncertainty
 from r2s.estimation.method import tell
-from r2s.estimation.prediction import Theta
+from r2s.estimation.prediction import Theta, by_coarser, remembering
 from r2s.estimation.problem import Problem, Problems, problems_on_mpm
 from r2s.estimation.standard_errors import OtherMesh, factor
 from r2s.materials.fabric import Fabric
@@ -63,11 +63,13 @@ def descend_by_meshes(
       error); not with a `shape`.
     """
     levels = [(shape,) * len(recordings)] if shape else _levels(recordings)
+    problems_on = functools.cache(partial(_problems, recordings, space))
+    if len(levels) > 1:
+        run = run._replace(derive=remembering(by_coarser(_coarser(problems_on, levels))))
     if finest:
         levels = [levels[0], levels[-1]]
-    problems_on = functools.cache(partial(_problems, recordings, space))
     meshes = _Meshes(recordings, problems_on, run, levels[0])
-    meshes, search = _first(meshes, levels[0], leads_on=len(levels) > 1)
+    meshes, search = _first(meshes, levels[0], leads_on=len(levels) > 2 or finest)
     search, refused = _refined(meshes, search, levels[1:], finest)
     tell(run.progress, "standard errors")
     ratio = 2.0 if refused or _is_finest(search.shapes) else 0.5
@@ -119,13 +121,11 @@ class _Meshes(NamedTuple):
         search = multi_start(self.problems(shapes), run, start=start, words=words)
         return search._replace(shapes=shapes)
 
-    def completed(self, search: Search) -> Search:
-        """A search from the end of another, and from other starts: of several recordings these
-        begin on the coarsest mesh, where they take a quarter of the time."""
-        end = self.search(search.shapes, search.theta, leads_on=False)
-        end = end._replace(unsure=search.unsure)
+    def confirmed(self, search: Search) -> Search:
+        """The best of a search and of others from other starts: of several recordings these begin
+        on the coarsest mesh, where they take a quarter of the time."""
         is_single = len(self.recordings) == 1 or search.shapes == self.coarsest
-        return look_again(end, self.run, None if is_single else self.problems(self.coarsest))
+        return look_again(search, self.run, None if is_single else self.problems(self.coarsest))
 
 
 def _first(meshes: _Meshes, shapes: Shapes, leads_on: bool) -> tuple[_Meshes, Search]:
@@ -143,27 +143,24 @@ def _refined(
 ) -> tuple[Search, str]:
     """The search on meshes that resolve the fabric, and why finer ones were refused, or "".
 
-    Before the last level the search is completed, which may end at a softer fabric, and repeated
-    from other starts.
+    Before the last level the search is repeated from other starts.
     """
-    if not finer:
-        return look_again(search, meshes.run), ""
-    for shapes in finer:
-        is_last = shapes is finer[-1]
-        if is_last and not finest:
-            search = meshes.completed(search)
+    for number, shapes in enumerate(finer, 1):
+        left = len(finer) - number
+        if not left and not finest:
+            search = meshes.confirmed(search)
             if not is_too_coarse(meshes.recordings, search.fabric, search.shapes):
-                break
+                return search, ""
         try:
-            on_finer = meshes.search(shapes, search.theta, leads_on=not is_last)
+            on_finer = meshes.search(shapes, search.theta, leads_on=left > (0 if finest else 1))
             search = _continued(search, on_finer, meshes.run)
         except Diverged as error:
             if finest:
                 raise
             tell(meshes.run.progress, f"the finer mesh diverged: back to {_words(search.shapes)}")
-            search = search if is_last else meshes.completed(search)
+            search = meshes.confirmed(search) if left else search
             return search, f"{_words(shapes)} vertices, which it needs: {error}"
-    return search, ""
+    return (search if finer else look_again(search, meshes.run)), ""
 
 
 def _continued(before: Search, finer: Search, run: Run) -> Search:
@@ -278,6 +275,12 @@ def is_too_coarse(recordings: Recordings, fabric: Fabric, shapes: Shapes) -> boo
         resolution.warning(fabric, info.sheet.size, shape, info.scenario)
         for info, shape in zip(infos, shapes, strict=True)
     )
+
+
+def _coarser(problems_on: Callable[[Shapes], Problems], levels: list[Shapes]) -> dict[int, Problem]:
+    """The problems on the mesh before the finest, by the id of the scenario on the finest."""
+    pairs = zip(problems_on(levels[-1]), problems_on(levels[-2]), *levels[-2:], strict=True)
+    return {id(fine.scenario): own for fine, own, before, last in pairs if before != last}
 
 
 def _named(recordings: Recordings, shapes: Shapes) -> Shape:

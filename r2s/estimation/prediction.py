@@ -11,7 +11,7 @@ recordings of any number of points and all stages of a descent.
 
 import dataclasses
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,6 +25,7 @@ from r2s.compilation import compile_once
 from r2s.estimation.estimate import Nuisance
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, Problems, motion_alone
 from r2s.materials.fabric import Fabric
+from r2s.mesh.surface import nearest
 from r2s.scenarios.energy import clamp_force, energy_balance
 from r2s.scenarios.scenario import Scenario, at_frames, in_denser_air, resized, rollout
 
@@ -106,6 +107,7 @@ class Sensitivity(eqx.Module):
 
 Predicted = list[tuple[Prediction, Sensitivity]]  # of each recording
 Derive = Callable[[Problems, Theta, float | None], Predicted]  # as `derivatives_at`
+Slopes = Callable[[Problem, Theta, float | None], tuple[Prediction, Sensitivity]]
 
 
 def fabric_at(problem: Problem, theta: Theta) -> Fabric:
@@ -206,9 +208,45 @@ def _motions(problems: Problems, theta: Theta) -> list[tuple[Problem, Array]]:
     return [(motion_alone(problem), theta[index]) for problem, index in pairs]
 
 
-def remembering() -> Derive:
+def secant(
+    problems: Problems, predicted: Predicted, moved: list[Prediction], change: Theta
+) -> list[Sensitivity]:
+    """Slopes after a motion that is `change` away from a prediction with its slopes.
+
+    The least change of the slopes with which they explain the motion (Broyden 1965), in the
+    parameters that move the sheet; what cameras see of it stays. A diverged motion changes none.
+    """
+    known = []
+    for which, (old, slope) in enumerate(predicted):
+        own = change[theta_indices(problems, which)]
+        known.append(_secant(old, slope, moved[which], own, problems[0].space.dim + len(SHARED)))
+    return known
+
+
+@eqx.filter_jit
+def _secant(
+    old: Prediction, slope: Sensitivity, new: Prediction, change: Theta, moving: int
+) -> Sensitivity:
+    way = jnp.where(jnp.arange(len(change)) < moving, change, 0)
+    square = way @ way
+    way = jnp.where(new.ok & (square > 0), way / jnp.where(square > 0, square, 1), 0)
+
+    def explained(before, after, slope):
+        missed = jnp.where(new.ok, after - before - slope @ change, 0)
+        return slope + missed[..., None] * way
+
+    force = slope.force
+    if not (force is None or old.force is None or new.force is None):
+        force = explained(old.force, new.force, force)
+    return Sensitivity(explained(old.x, new.x, slope.x), force)
+
+
+def remembering(slopes: Slopes | None = None) -> Derive:
     """`derivatives_at` with a cache of the latest places: a stage of a descent, a search and the
-    standard errors begin where another ended. Derivatives of more frames serve fewer, too."""
+    standard errors begin where another ended. Derivatives of more frames serve fewer, too.
+
+    `slopes`: the derivatives of one recording; None: exact ones.
+    """
     # by scenario, theta and width, the latest last: the scenario, the number of frames, derivatives
     cache: dict[tuple, tuple[Scenario, int, tuple[Prediction, Sensitivity]]] = {}
     lock = threading.Lock()
@@ -223,7 +261,7 @@ def remembering() -> Derive:
         with lock:
             known = cache.get(key)
         if known is None or known[1] < frames:
-            known = scenario, frames, _sensitivities(problem, theta, width)
+            known = scenario, frames, (slopes or _sensitivities)(problem, theta, width)
         with lock:
             cache.pop(key, None)
             cache[key] = known
@@ -232,6 +270,38 @@ def remembering() -> Derive:
         return known[2]
 
     return derive
+
+
+def by_coarser(coarser: Mapping[int, Problem]) -> Slopes:
+    """Derivatives of motions on fine meshes by those on coarser ones: exact motions, and slopes
+    that are laid onto the finer mesh. A derivative on the finer mesh takes several times as long,
+    and half a minute to compile.
+
+    - `coarser`: the same recording on a coarser mesh, by the `id` of its scenario on the finer.
+
+    Exact where a recording has none, and where the coarser motion or its derivative diverges.
+    """
+
+    def slopes(problem: Problem, theta: Theta, width: float | None):
+        other = coarser.get(id(problem.scenario))
+        if other is not None:
+            motion = dataclasses.replace(motion_alone(other), wanted=problem.wanted)
+            _, slope = _sensitivities(motion, theta, width)
+            if all(bool(jnp.all(jnp.isfinite(part))) for part in jax.tree.leaves(slope)):
+                return predict_compiled(problem, theta), laid_onto(other, problem, slope)
+        return _sensitivities(problem, theta, width)
+
+    return slopes
+
+
+def laid_onto(own: Problem, other: Problem, slope: Sensitivity) -> Sensitivity:
+    """A derivative on the mesh of one problem at the vertices of another's."""
+    meshes = own.scenario.scene.mesh, other.scenario.scene.mesh
+    flat, onto = (mesh.lay_flat() for mesh in meshes)
+    face, weights = nearest(onto, flat, meshes[0].faces)
+    corners = meshes[0].faces[face]
+    laid = jnp.einsum("vk,fvkiu->fviu", weights, slope.x[:, corners])
+    return Sensitivity(laid, slope.force)
 
 
 def _bytes(known: tuple[Scenario, int, tuple[Prediction, Sensitivity]]) -> int:

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from r2s._util.threads import thread_map
 from r2s.compilation import compile_once
 from r2s.estimation.gauss_newton import (
     MARGIN,
@@ -28,7 +29,6 @@ from r2s.estimation.gauss_newton import (
     least_weight,
     loss_from,
     normal_from,
-    normals_at,
     only_held,
     prior_terms,
     prior_weight,
@@ -41,9 +41,9 @@ from r2s.estimation.normal_equations import normal_equations_of
 from r2s.estimation.prediction import (
     Derive,
     Predicted,
-    Sensitivity,
     Theta,
     derivatives_at,
+    laid_onto,
     predict_compiled,
     predictions_at,
     theta_indices,
@@ -51,7 +51,6 @@ from r2s.estimation.prediction import (
 )
 from r2s.estimation.problem import Problem, Problems, motion_alone, seen_where
 from r2s.materials.parameters import InformedSpace, stiffens
-from r2s.mesh.surface import nearest
 from r2s.scenarios.resolution import ORDER
 
 FARTHEST = 2.0  # times the median distance, beyond which a step is shortened
@@ -154,18 +153,26 @@ def covariance_at(
 ) -> Matrix:
     """`covariance` of theta at the end of a descent, with `budget.num_probes` neighbours.
 
+    The steps from neighbours have their own motions and the end's slopes: what the linear model
+    misses scatters them.
+
     - `tried_on`: the same recordings on the mesh of the neighbours, one standard error of that mesh
       away; None: the mesh of the descent.
     """
     other, start = tried_on or problems, end
+    predicted = derive(other, end.theta, budget.secant_width)
     if other is not problems:
-        predicted = derive(other, end.theta, budget.secant_width)
         start = dataclasses.replace(end, normal=normal_from(other, end.theta, predicted, end.scale))
     apart = jnp.zeros((0, len(end.theta)), float)
     if budget.num_probes:
         weight = prior_weight(other, start.normal)
         places = list(sample_around(other, start, weight, budget.num_probes, key))
-        normals = normals_at(other, places, [end.scale] * len(places), budget.secant_width)
+        motions = thread_map(lambda place: predictions_at(other, place), places)
+        slopes = [slope for _, slope in predicted]
+        normals = [
+            normal_from(other, place, list(zip(moved, slopes, strict=True)), end.scale)
+            for place, moved in zip(places, motions, strict=True)
+        ]
         apart = steps_apart(other, start, weight, list(zip(places, normals, strict=True)))
     prior = prior_weight(problems, end.normal)
     return np.asarray(covariance(problems, end, prior, apart, is_truth))
@@ -286,7 +293,7 @@ def mesh_error(
         prediction, slope = predicted[which]
         moved = predict_compiled(motion_alone(finer), theta)
         before = equations(own, prediction, slope, end.scale)
-        after = equations(finer, moved, _laid_onto(own, finer, slope), end.scale)
+        after = equations(finer, moved, laid_onto(own, finer, slope), end.scale)
         change = np.zeros((len(before.scores), size))
         change[:, index] = share * (np.asarray(after.scores) - np.asarray(before.scores))
         changes.append(change)
@@ -301,16 +308,6 @@ def mesh_error(
     bias = np.clip(bias, -1, 1)
     apart = other.factor * change @ np.linalg.inv(matrix)
     return bias, np.outer(bias, bias) + apart.T @ apart
-
-
-def _laid_onto(own: Problem, other: Problem, slope: Sensitivity) -> Sensitivity:
-    """A derivative on the mesh of one problem at the vertices of another's."""
-    meshes = own.scenario.scene.mesh, other.scenario.scene.mesh
-    flat, onto = (mesh.lay_flat() for mesh in meshes)
-    face, weights = nearest(onto, flat, meshes[0].faces)
-    corners = meshes[0].faces[face]
-    laid = jnp.einsum("vk,fvkiu->fviu", weights, slope.x[:, corners])
-    return Sensitivity(laid, slope.force)
 
 
 def with_mesh_error(
