@@ -433,8 +433,8 @@ def _resumed(checkpoint: Path, run: dict[str, str], budget: Budget) -> list[Iter
     normal = Normal(none, none, none, vector, square, square)
     like = Descent(vector, normal, none, none, none, count, count)
     stored = checkpoints.tree_from(arrays, like)
-    exact = np.flatnonzero(~np.any(stored.age, axis=1))[-1]  # slopes of secants are not kept
+    exact = np.flatnonzero(~np.any(stored.age, axis=1))  # slopes of secants are not kept
     return [
         [jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], stored) for j in range(budget.num_starts)]
-        for i in range(exact + 1)
+        for i in range(exact[-1] + 1 if len(exact) else 0)
     ]

@@ -23,7 +23,7 @@ from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import FINEST, MARGIN, Descent, loss_from
 from r2s.estimation.judgement import with_uncertainty
 from r2s.estimation.method import tell
-from r2s.estimation.prediction import Theta, by_coarser, remembering
+from r2s.estimation.prediction import Theta
 from r2s.estimation.problem import Problem, Problems, problems_on_mpm
 from r2s.estimation.standard_errors import OtherMesh, factor
 from r2s.materials.fabric import Fabric
@@ -64,8 +64,6 @@ def descend_by_meshes(
     """
     levels = [(shape,) * len(recordings)] if shape else _levels(recordings)
     problems_on = functools.cache(partial(_problems, recordings, space))
-    if len(levels) > 1:
-        run = run._replace(derive=remembering(by_coarser(_coarser(problems_on, levels))))
     if finest:
         levels = [levels[0], levels[-1]]
     meshes = _Meshes(recordings, problems_on, run, levels[0])
@@ -152,7 +150,8 @@ def _refined(
             if not is_too_coarse(meshes.recordings, search.fabric, search.shapes):
                 return search, ""
         try:
-            on_finer = meshes.search(shapes, search.theta, leads_on=left > (0 if finest else 1))
+            leads_on = left > (0 if finest else 1)
+            on_finer = meshes.search(shapes, search.theta, leads_on)
             search = _continued(search, on_finer, meshes.run)
         except Diverged as error:
             if finest:
@@ -275,12 +274,6 @@ def is_too_coarse(recordings: Recordings, fabric: Fabric, shapes: Shapes) -> boo
         resolution.warning(fabric, info.sheet.size, shape, info.scenario)
         for info, shape in zip(infos, shapes, strict=True)
     )
-
-
-def _coarser(problems_on: Callable[[Shapes], Problems], levels: list[Shapes]) -> dict[int, Problem]:
-    """The problems on the mesh before the finest, by the id of the scenario on the finest."""
-    pairs = zip(problems_on(levels[-1]), problems_on(levels[-2]), *levels[-2:], strict=True)
-    return {id(fine.scenario): own for fine, own, before, last in pairs if before != last}
 
 
 def _named(recordings: Recordings, shapes: Shapes) -> Shape:

@@ -11,7 +11,7 @@ recordings of any number of points and all stages of a descent.
 
 import dataclasses
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,7 +25,6 @@ from r2s.compilation import compile_once
 from r2s.estimation.estimate import Nuisance
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, Problems, motion_alone
 from r2s.materials.fabric import Fabric
-from r2s.mesh.surface import nearest
 from r2s.scenarios.energy import clamp_force, energy_balance
 from r2s.scenarios.scenario import Scenario, at_frames, in_denser_air, resized, rollout
 
@@ -107,7 +106,6 @@ class Sensitivity(eqx.Module):
 
 Predicted = list[tuple[Prediction, Sensitivity]]  # of each recording
 Derive = Callable[[Problems, Theta, float | None], Predicted]  # as `derivatives_at`
-Slopes = Callable[[Problem, Theta, float | None], tuple[Prediction, Sensitivity]]
 
 
 def fabric_at(problem: Problem, theta: Theta) -> Fabric:
@@ -233,7 +231,7 @@ def _secant(
 
     def explained(before, after, slope):
         missed = jnp.where(new.ok, after - before - slope @ change, 0)
-        return slope + missed[..., None] * way
+        return slope + jnp.multiply.outer(missed, way)
 
     force = slope.force
     if not (force is None or old.force is None or new.force is None):
@@ -241,12 +239,9 @@ def _secant(
     return Sensitivity(explained(old.x, new.x, slope.x), force)
 
 
-def remembering(slopes: Slopes | None = None) -> Derive:
+def remembering() -> Derive:
     """`derivatives_at` with a cache of the latest places: a stage of a descent, a search and the
-    standard errors begin where another ended. Derivatives of more frames serve fewer, too.
-
-    `slopes`: the derivatives of one recording; None: exact ones.
-    """
+    standard errors begin where another ended. Derivatives of more frames serve fewer, too."""
     # by scenario, theta and width, the latest last: the scenario, the number of frames, derivatives
     cache: dict[tuple, tuple[Scenario, int, tuple[Prediction, Sensitivity]]] = {}
     lock = threading.Lock()
@@ -261,7 +256,7 @@ def remembering(slopes: Slopes | None = None) -> Derive:
         with lock:
             known = cache.get(key)
         if known is None or known[1] < frames:
-            known = scenario, frames, (slopes or _sensitivities)(problem, theta, width)
+            known = scenario, frames, _sensitivities(problem, theta, width)
         with lock:
             cache.pop(key, None)
             cache[key] = known
@@ -270,38 +265,6 @@ def remembering(slopes: Slopes | None = None) -> Derive:
         return known[2]
 
     return derive
-
-
-def by_coarser(coarser: Mapping[int, Problem]) -> Slopes:
-    """Derivatives of motions on fine meshes by those on coarser ones: exact motions, and slopes
-    that are laid onto the finer mesh. A derivative on the finer mesh takes several times as long,
-    and half a minute to compile.
-
-    - `coarser`: the same recording on a coarser mesh, by the `id` of its scenario on the finer.
-
-    Exact where a recording has none, and where the coarser motion or its derivative diverges.
-    """
-
-    def slopes(problem: Problem, theta: Theta, width: float | None):
-        other = coarser.get(id(problem.scenario))
-        if other is not None:
-            motion = dataclasses.replace(motion_alone(other), wanted=problem.wanted)
-            _, slope = _sensitivities(motion, theta, width)
-            if all(bool(jnp.all(jnp.isfinite(part))) for part in jax.tree.leaves(slope)):
-                return predict_compiled(problem, theta), laid_onto(other, problem, slope)
-        return _sensitivities(problem, theta, width)
-
-    return slopes
-
-
-def laid_onto(own: Problem, other: Problem, slope: Sensitivity) -> Sensitivity:
-    """A derivative on the mesh of one problem at the vertices of another's."""
-    meshes = own.scenario.scene.mesh, other.scenario.scene.mesh
-    flat, onto = (mesh.lay_flat() for mesh in meshes)
-    face, weights = nearest(onto, flat, meshes[0].faces)
-    corners = meshes[0].faces[face]
-    laid = jnp.einsum("vk,fvkiu->fviu", weights, slope.x[:, corners])
-    return Sensitivity(laid, slope.force)
 
 
 def _bytes(known: tuple[Scenario, int, tuple[Prediction, Sensitivity]]) -> int:

@@ -41,9 +41,9 @@ from r2s.estimation.normal_equations import normal_equations_of
 from r2s.estimation.prediction import (
     Derive,
     Predicted,
+    Sensitivity,
     Theta,
     derivatives_at,
-    laid_onto,
     predict_compiled,
     predictions_at,
     theta_indices,
@@ -51,6 +51,7 @@ from r2s.estimation.prediction import (
 )
 from r2s.estimation.problem import Problem, Problems, motion_alone, seen_where
 from r2s.materials.parameters import InformedSpace, stiffens
+from r2s.mesh.surface import nearest
 from r2s.scenarios.resolution import ORDER
 
 FARTHEST = 2.0  # times the median distance, beyond which a step is shortened
@@ -293,7 +294,7 @@ def mesh_error(
         prediction, slope = predicted[which]
         moved = predict_compiled(motion_alone(finer), theta)
         before = equations(own, prediction, slope, end.scale)
-        after = equations(finer, moved, laid_onto(own, finer, slope), end.scale)
+        after = equations(finer, moved, _laid_onto(own, finer, slope), end.scale)
         change = np.zeros((len(before.scores), size))
         change[:, index] = share * (np.asarray(after.scores) - np.asarray(before.scores))
         changes.append(change)
@@ -308,6 +309,16 @@ def mesh_error(
     bias = np.clip(bias, -1, 1)
     apart = other.factor * change @ np.linalg.inv(matrix)
     return bias, np.outer(bias, bias) + apart.T @ apart
+
+
+def _laid_onto(own: Problem, other: Problem, slope: Sensitivity) -> Sensitivity:
+    """A derivative on the mesh of one problem at the vertices of another's."""
+    meshes = own.scenario.scene.mesh, other.scenario.scene.mesh
+    flat, onto = (mesh.lay_flat() for mesh in meshes)
+    face, weights = nearest(onto, flat, meshes[0].faces)
+    corners = meshes[0].faces[face]
+    laid = jnp.einsum("vk,fvkiu->fviu", weights, slope.x[:, corners])
+    return Sensitivity(laid, slope.force)
 
 
 def with_mesh_error(
