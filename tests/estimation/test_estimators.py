@@ -175,7 +175,8 @@ def test_an_estimate_lowers_the_loss_and_survives_its_file(estimated):
     assert float(again.fabric.membrane.c12) == pytest.approx(float(found.fabric.membrane.c12))
     names = ["density ratio", "air ratio", "size ratio", *OWN]
     assert [c.name for c in again.nuisances] == names
-    assert again.nuisances == found.nuisances and again.fits == found.fits
+    assert again.nuisances == found.nuisances
+    assert repr(again.fits) == repr(found.fits)  # which hold NaN
     np.testing.assert_allclose(again.narrowing, found.narrowing)
 
 
@@ -187,7 +188,7 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, estimated, tmp
         pass
 
     def stop(iteration, loss):
-        if iteration == 1:
+        if iteration == 6:
             raise Stop
 
     with pytest.raises(Stop):
@@ -200,7 +201,7 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, estimated, tmp
     found = descend(small, SMALL, checkpoint=path, progress=count, key=jr.key(0))
     np.testing.assert_array_equal(found.values, whole.values)
     np.testing.assert_array_equal(found.losses, whole.losses)
-    assert seen[0] == 2  # and did not begin again
+    assert 2 <= seen[0] <= 6  # from its latest exact derivative, not from the start
     with pytest.raises(ValueError, match="is of another run .run .* there, .* asked"):
         descend(small, SMALL, checkpoint=path, key=jr.key(1))
     path.write_bytes(b"nothing")
