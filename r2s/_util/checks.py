@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+SHOWN = 200  # characters of a value in an error
+
 
 def expect(holds: bool | np.bool_, problem: str) -> None:
     """Raise `ValueError` that says the problem, unless the condition holds."""
@@ -13,7 +15,14 @@ def expect(holds: bool | np.bool_, problem: str) -> None:
 
 def expect_value(holds: bool, where: str, expected: str, found: Any) -> None:
     """Raise `ValueError` that says what was expected where, unless the condition holds."""
-    expect(holds, f"{where}: expected {expected}, found {found!r}")
+    if not holds:
+        raise ValueError(f"{where}: expected {expected}, found {shown(found)}")
+
+
+def shown(value: Any) -> str:
+    """A value as an error shows it: the beginning of a long one."""
+    text = repr(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def check_kinds(call: str, **expected: tuple[Any, type]) -> None:

@@ -6,19 +6,19 @@ import functools
 import hashlib
 import io
 import json
-import math
 import os
 import re
 import shutil
+import sys
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from r2s._util.checks import expect_value
+from r2s._util.checks import SHOWN, expect_value
 
 T = TypeVar("T")
 # or a string, which may look like one
@@ -87,11 +87,11 @@ def write_npz(path: Path | str, **arrays: Any) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def read_npz(path: Path | str, *needed: str) -> dict[str, np.ndarray]:
-    """The arrays of an NPZ, by name.
+def read_npz(path: Path | str, *needed: str, text: str = "") -> dict[str, np.ndarray]:
+    """The arrays of an NPZ, by name: numbers, but for one of the name `text`.
 
-    Raises FileNotFoundError, or a ValueError (which does not name the file) when it is damaged or
-    one of the arrays `needed` is missing.
+    Raises FileNotFoundError, or a ValueError (which does not name the file) when it is damaged, one
+    of the arrays `needed` is missing, or one that holds something else.
     """
     try:
         stored = np.load(path, allow_pickle=False)
@@ -102,9 +102,15 @@ def read_npz(path: Path | str, *needed: str) -> dict[str, np.ndarray]:
     except FileNotFoundError:
         raise
     except Exception as error:  # a damaged archive raises anything, from EOFError to zlib.error
-        raise ValueError(f"{error}: copy the file again, or make it anew") from error
+        words = str(error)[:SHOWN]
+        raise ValueError(f"{words}: copy the file again, or make it anew") from error
     if lacking := [name for name in needed if name not in arrays]:
         raise ValueError(f"lacks the arrays {', '.join(lacking)}; has {', '.join(arrays)}")
+    for name, array in arrays.items():
+        found = np.asarray(array).dtype  # of bytes where the archive holds another kind of file
+        if found.kind not in ("U" if name == text else "fiub"):
+            expected = "text" if name == text else "numbers"
+            raise ValueError(f"{name}: expected {expected}, found {found}")
     return arrays
 
 
@@ -118,14 +124,21 @@ def read_json(path: Path | str, kind: type[T], comments: bool = False) -> T:
     OSError, or a ValueError that names the file and the field: no JSON, fields missing or unknown,
     values of another type, or what `kind` itself refuses.
     """
+    return parse(kind, load_json(path, comments), f"{path}")
+
+
+def load_json(
+    path: Path | str, comments: bool = False, each: Callable[[dict], Any] | None = None
+) -> Any:
+    """What JSON a file holds; `each` object in it may be replaced. With `comments`, those of C++
+    are skipped. Raises OSError, or a ValueError that names the file."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
         if comments:
             text = COMMENT.sub(lambda m: m[1] or re.sub(r"[^\n]", " ", m[0]), text)
-        value = json.loads(text)
-    except ValueError as error:
+        return json.loads(text, object_hook=each)
+    except (ValueError, RecursionError) as error:  # no text, no JSON, or nested too deeply
         raise ValueError(f"{path}: no JSON: {error}") from error
-    return parse(kind, value, f"{path}")
 
 
 def _free(folder: Path) -> str:
@@ -159,7 +172,8 @@ def parse(kind: Any, value: Any, where: str) -> Any:
         return {key: parse(arguments[1], v, f"{where}: {key}") for key, v in value.items()}
     if kind is float:
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        expect_value(number and math.isfinite(value), where, "a finite number", value)
+        holds = number and abs(value) <= sys.float_info.max
+        expect_value(holds, where, "a finite number", value)
         return float(value)
     expect_value(type(value) is kind, where, f"{kind.__name__}", value)
     return value

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from r2s._util.checks import expect_value as expect
-from r2s._util.files import write_json
+from r2s._util.files import load_json, write_json
 from r2s.estimation import estimate as estimates
 from r2s.estimation.estimate import Estimate
 from r2s.materials import presets
@@ -151,8 +151,9 @@ def read(path: Path | str) -> Card:
     that are missing or unknown, values of another type, numbers that no fabric has, an estimate
     of another fabric.
     """
+    stored = load_json(path)
     try:
-        return from_json(json.loads(Path(path).read_text(encoding="utf-8")))
+        return from_json(stored)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from r2s._util.files import write_bytes
+from r2s._util.files import SHOWN, shown, write_bytes
 
 FORMAT = "r2s-checkpoint/1"
 HEADER = "checkpoint"  # the array that holds the JSON text
+FEW = 5  # differences that an error names
 T = TypeVar("T")
 
 
@@ -46,13 +47,13 @@ def read(path: Path | str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop(HEADER)))
-        form, run = header["format"], header["run"]
+        form, run = header["format"], dict(header["run"])
     except FileNotFoundError:
         raise
     except Exception as error:  # a damaged file raises anything
-        raise ValueError(f"{path} is no checkpoint: {error}; remove it") from error
+        raise ValueError(f"{path} is no checkpoint: {str(error)[:SHOWN]}; remove it") from error
     if form != FORMAT:
-        raise ValueError(f"{path}: expected format {FORMAT}, found {form}")
+        raise ValueError(f"{path}: expected format {FORMAT}, found {shown(form)}")
     return arrays, run
 
 
@@ -67,7 +68,8 @@ def load(path: Path | str, run: Mapping[str, Any]) -> dict[str, np.ndarray] | No
     asked = json.loads(json.dumps(dict(run)))  # tuples become lists
     keys = [key for key in {**stored, **asked} if stored.get(key) != asked.get(key)]
     if keys:
-        pairs = ", ".join(f"{key} {stored.get(key)} there, {asked.get(key)} asked" for key in keys)
+        there = {key: str(stored.get(key))[:SHOWN] for key in keys[:FEW]}
+        pairs = ", ".join(f"{key} {it} there, {asked.get(key)} asked" for key, it in there.items())
         raise ValueError(f"{path} is of another run ({pairs}): remove it, or choose another file")
     return arrays
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from r2s._util.files import shown
 from r2s.materials.fabric import Fabric
 from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
 from r2s.materials.parameters import UNIFORM_DEVIATION, ParameterSpace, Range
@@ -346,7 +347,10 @@ def _agreement(stored: dict[str, Any]) -> Agreement:
 
 
 def _numbers(values: Any) -> np.ndarray:
-    return np.array(values, dtype=float)  # None becomes NaN
+    try:
+        return np.array(values, dtype=float)  # None becomes NaN
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"expected numbers, found {shown(values)}") from error
 
 
 READERS: dict[str, Callable[[Any], Any]] = {

@@ -20,7 +20,6 @@ the extension at rest, `zero` [m], where it is known.
 """
 
 import hashlib
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +30,7 @@ import numpy as np
 
 from r2s._util.checks import expect
 from r2s._util.extras import require
-from r2s._util.files import parse
+from r2s._util.files import load_json, parse, shown
 from r2s.laboratory.bending import DRAPE_DEVIATION, RADII, Cantilever, Drape
 from r2s.laboratory.estimate import Test
 from r2s.laboratory.pull import SPECIMEN, Pull
@@ -128,7 +127,7 @@ class _File:
     drapes: tuple[_Drape, ...] = ()
 
     def __post_init__(self) -> None:
-        expect(self.format == FORMAT, f"expected the format {FORMAT}, found {self.format}")
+        expect(self.format == FORMAT, f"expected the format {FORMAT}, found {shown(self.format)}")
 
 
 def read_tests(path: Path | str) -> LaboratoryTests:
@@ -138,13 +137,10 @@ def read_tests(path: Path | str) -> LaboratoryTests:
     format, keys that are missing or unknown, units and values that no test has, no test at all.
     """
     path = Path(path)
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8-sig"), object_hook=_with_angle)
-        if isinstance(stored, dict) and "fabric" in stored:
-            raise ValueError(f"{path}: this is a card; laboratory tests or recordings are expected")
-        content = parse(_File, stored, f"{path}")
-    except (json.JSONDecodeError, UnicodeDecodeError, OverflowError, RecursionError) as error:
-        raise ValueError(f"{path}: no JSON: {error}") from error
+    stored = load_json(path, each=_with_angle)
+    if isinstance(stored, dict) and "fabric" in stored:
+        raise ValueError(f"{path}: this is a card; laboratory tests or recordings are expected")
+    content = parse(_File, stored, f"{path}")
     tests: list[Test] = []
     for kind in ("pulls", "cantilevers", "drapes"):
         for number, entry in enumerate(getattr(content, kind), 1):
@@ -194,7 +190,7 @@ def read_knit(path: Path | str, direction: float, specimen: float = SPECIMEN) ->
     pulls = []
     for name, (along, across), force in zip(KNIT_PULLS, spans, forces, strict=True):
         extension, middle = (along - length) * scale, across / width * size[1]
-        title = f"{path.name}: {name}"
+        title = f"{path}: {name}"
         strip = extension, force, size, direction, middle, specimen
         pulls.append(Pull.make(*strip, title, zero=0.0))  # the notebook's
     return pulls

@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import math
+import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -110,7 +111,9 @@ def _unit(part: str, law: type, name: str) -> str:
 def _law_from(stored: Any, part: str, where: str) -> Any:
     kinds = {kind.__name__: kind for kind in LAWS[part][0]}
     name = stored.get("law") if isinstance(stored, dict) else None
-    expect(name in kinds, f"{where}: law", f"one of {', '.join(kinds)}", name)
+    expect(
+        isinstance(name, str) and name in kinds, f"{where}: law", f"one of {', '.join(kinds)}", name
+    )
     kind = kinds[name]  # pyright: ignore[reportArgumentType]
     names = _fields(kind)
     check_keys(stored, ("law", *names), where)
@@ -126,8 +129,14 @@ def _value(stored: Any, unit: str, where: str, shape: tuple[int, ...]) -> jax.Ar
     check_keys(stored, ("value", "unit"), where)
     expect(stored["unit"] == unit, f"{where}: unit", repr(unit), stored["unit"])
     values = np.array(stored["value"], object)
-    numbers = [isinstance(v, int | float | None) and not isinstance(v, bool) for v in values.flat]
     expected = f"numbers of shape {shape}" if shape else "a number, or null"
-    fits = values.shape == shape and all(numbers)
+    fits = values.shape == shape and all(map(_is_number, values.flat))
     expect(fits, f"{where}: value", expected, stored["value"])
     return jnp.asarray(values.astype(float), float)  # None is NaN
+
+
+def _is_number(value: Any) -> bool:
+    """Whether JSON gave a number that fits into 64 bits, NaN, or null."""
+    if isinstance(value, int):
+        return not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return isinstance(value, float | None)

@@ -15,6 +15,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from r2s._util.extras import require
+from r2s._util.files import SHOWN
+
+MOST_NUMBERS = 10_000  # of a point, in a field of a PCD
 
 
 def numbers(what: str, values: Any, *shape: int | str) -> Float[np.ndarray, "..."]:
@@ -24,8 +27,8 @@ def numbers(what: str, values: Any, *shape: int | str) -> Float[np.ndarray, "...
     """
     try:
         array = np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{what}: expected an array of numbers: {error}") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{what}: expected an array of numbers: {str(error)[:SHOWN]}") from error
     if array.size == 0:
         raise ValueError(f"{what} is empty")
     sizes = zip(shape, array.shape, strict=False)
@@ -122,7 +125,8 @@ def read_values(path: Path | str, dtype: type | None = np.float64) -> Num[np.nda
         raise
     except Exception as error:  # the libraries raise anything, from IndexError to their own types
         kind = path.suffix.lower()[1:]
-        raise ValueError(f"{path}: cannot be read as {kind}: {error}: copy it again") from error
+        words = str(error)[:SHOWN]
+        raise ValueError(f"{path}: cannot be read as {kind}: {words}: copy it again") from error
 
 
 def voxel_means(points: Float[np.ndarray, "point 3"], voxel: float) -> Float[np.ndarray, "cell 3"]:
@@ -200,18 +204,30 @@ def _read_xyz(path: Path) -> np.ndarray:
     return values[:, :3] if values.shape[1] == 6 else values  # normals or colours follow
 
 
-def _read_pcd(path: Path) -> np.ndarray:
+def open_pcd(path: Path) -> Any:
+    """A cloud of pypcd4, which holds as many points as its header promises.
+
+    Raises FileNotFoundError, ImportError, ValueError, or anything that pypcd4 raises.
+    """
     if not path.is_file():  # before pypcd4, which wraps this error
         raise FileNotFoundError(f"{path}: no such file")
     reader = require("pypcd4", "pcd", f"{path}: clouds in pcd files").PointCloud
     data = path.read_bytes()
+    counts = re.search(rb"^COUNT\s+(.*)$", data, re.MULTILINE)
+    for count in counts[1].split() if counts else ():
+        if int(count) > MOST_NUMBERS:  # pypcd4 makes a name for each of them
+            raise ValueError(f"a field has {count[:20].decode()} numbers a point")
     if re.search(rb"^DATA\s+ascii", data, re.MULTILINE):  # pypcd4 stumbles over blanks at line ends
         data = b"\n".join(b" ".join(line.split()) for line in data.splitlines() if line.strip())
     cloud = reader.from_fileobj(io.BytesIO(data))
-    values = cloud.numpy(("x", "y", "z"))
-    if len(values) != cloud.points:
-        raise ValueError(f"the header promises {cloud.points} points, found {len(values)}")
-    return values
+    found = cloud.pc_data.size
+    if found != cloud.points:
+        raise ValueError(f"the header promises {cloud.points} points, found {found}")
+    return cloud
+
+
+def _read_pcd(path: Path) -> np.ndarray:
+    return open_pcd(path).numpy(("x", "y", "z"))
 
 
 def _read_e57(path: Path) -> np.ndarray:

@@ -5,12 +5,11 @@ A data set is a JSON file in `data_manifests/`: a `Dataset`, or the
 redistributed or downloaded without a person: each says how it is got.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from r2s._util.files import read_json
+from r2s._util.files import load_json, read_json, shown
 from r2s.recordings.clouds import read_values
 from r2s.recordings.manifest import (
     Manifest,
@@ -73,10 +72,9 @@ def read_dataset(path: Path | str) -> Dataset | Manifest:
 
     Raises FileNotFoundError, or a ValueError that names the file and the field.
     """
-    try:
-        keys = set(json.loads(Path(path).read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: no JSON object: {error}") from error
+    keys = load_json(path)
+    if not isinstance(keys, dict):
+        raise ValueError(f"{path}: expected a JSON object, found {shown(keys)}")
     if "scenarios" in keys:
         return read_manifest(path)
     return read_json(path, Swings if "bar" in keys else Dataset)

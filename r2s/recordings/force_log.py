@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 
+from r2s._util.files import shown
+
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "sec": 1.0}
 NEWTONS = {"N": 1.0, "mN": 1e-3, "cN": 1e-2, "kN": 1e3}
 NEWTONS |= {"gf": 9.80665e-3, "kgf": 9.80665, "lbf": 4.4482216}
@@ -195,8 +197,8 @@ def _column(
         name, units = next(iter(choice.items()))
         raise ValueError(
             f"{path}: expected one column {examples} with its unit, such as "
-            f"'{name}_{next(iter(units))}', found {len(columns)} in {header}: rename it, or name "
-            "the column that is meant"
+            f"'{name}_{next(iter(units))}', found {len(columns)} in {shown(header)}: rename it, or "
+            "name the column that is meant"
         )
     index, unit = columns[0]
     if unit in GRAMS and "force" in choice:
@@ -239,7 +241,9 @@ def number_in(path: Path | str, line: int, cell: str, what: str = "a finite numb
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise ValueError(f"{path}: line {line}: expected {what}, found {cell!r}: write a number")
+        raise ValueError(
+            f"{path}: line {line}: expected {what}, found {shown(cell)}: write a number"
+        )
     return value
 
 

@@ -1,6 +1,5 @@
 """Paths of grippers with times of their own: CSV, TUM, NPZ and JSON files, and plain arrays."""
 
-import json
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
-from r2s._util.files import read_npz
+from r2s._util.files import load_json, read_npz
 from r2s.recordings.clouds import numbers, read_values
 from r2s.recordings.force_log import (
     METRES,
@@ -152,7 +151,7 @@ def _of_arrays(path: Path, order: str):
     if path.suffix.lower() == ".npz":
         stored = read_npz(path, "times", "positions")
     else:
-        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored = load_json(path)
         if not isinstance(stored, dict) or not {"times", "positions"} <= stored.keys():
             raise ValueError("expected an object with times and positions")
     positions = _positions(stored["positions"])
@@ -167,9 +166,9 @@ def _of_arrays(path: Path, order: str):
 
 
 def _positions(values) -> np.ndarray:
-    values = np.asarray(values, float)
     try:
-        values = numbers("the path", values, "knot", *["gripper"] * (values.ndim - 2), 3)
+        axes = np.ndim(values)  # ValueError where rows differ in length
+        values = numbers("the path", values, "knot", *["gripper"] * (axes - 2), 3)
     except ValueError as error:
         raise ValueError(f"{error}: expected (knot, 3) or (knot, gripper, 3)") from error
     return values[:, None] if values.ndim == 2 else values

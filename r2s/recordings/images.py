@@ -1,5 +1,6 @@
 """Images in files: depth, masks, video."""
 
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -81,13 +82,29 @@ def read_png(path: Path) -> np.ndarray:
         raise ValueError(
             f"{path}: no PNG: found the bytes {data[:8]!r}: export it as PNG, depth also as NPY"
         )
-    # by hand, since the decoder says nothing, or takes a part for the whole
-    is_whole = PNG_END in data[-64:]
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if is_whole else None
+    pixels = np.frombuffer(data, np.uint8)
+    image = cv2.imdecode(pixels, cv2.IMREAD_UNCHANGED) if _is_whole(data) else None
     if image is None:
-        what = "damaged" if is_whole else "truncated"
+        what = "damaged" if PNG_END in data[-64:] else "truncated"
         raise ValueError(f"{path}: {what} PNG of {len(data)} bytes: copy or export it again")
     return image
+
+
+def _is_whole(data: bytes) -> bool:
+    """Whether the chunks of a PNG follow each other to its end, each with its checksum (ISO 15948).
+
+    By hand: OpenCV takes a part for the whole, and reserves the gigabytes that a damaged length
+    asks for.
+    """
+    at = len(PNG_START)
+    while at + 12 <= len(data):  # length, name, what is in it, checksum
+        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end
+    return False
 
 
 DEPTHS, MASKS, COLOURS = (".png", ".npy"), (".png",), (".png", ".jpg", ".jpeg")
@@ -148,8 +165,9 @@ def read_colour(path: Path, resolution: tuple[int, int]) -> UInt8[np.ndarray, "d
     data = np.frombuffer(path.read_bytes(), np.uint8)
     whole = path.suffix.lower() == ".png" or b"\xff\xd9" in data[-64:].tobytes()  # JPG's end
     # the camera's pixels, also where a tag asks viewers to turn them
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None or not whole:
+    how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, how) if whole else None
+    if image is None:
         raise ValueError(f"{path}: damaged or truncated image of {len(data)} bytes: copy it again")
     _check_size(path, image, resolution, "register colour to depth, as the camera's driver can")
     return image[..., ::-1]

@@ -334,7 +334,7 @@ def read_recording(
     else:
         times = times_of(place, frames, scenario.frame_rate)
     used = places_of(place, scenario.frames_used, frames.numbers)
-    knots, start = _clocks(name, track, times, scenario)
+    knots, start = _clocks(place, track, times, scenario)
     clock = knots - scenario.time_offset  # that of the frames
     cuts, segmenter = [] if cuts is None else cuts, None
     if (how := found.segmentation) is not None:
@@ -372,10 +372,14 @@ def read_recording(
         info = replace(info, views=replace(info.views, hidden=hidden))
     clouds = [in_world(points) for points in clouds]
     check_unit(place, clouds[0], scenario.sheet.size)
-    return make_recording(clouds, times - start + scenario.time_offset, held, knots - start, info)
+    times = times - start + scenario.time_offset
+    try:
+        return make_recording(clouds, times, held, knots - start, info)
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
 
 
-def _clocks(name: str, track: Track, times: np.ndarray, scenario: Scenario):
+def _clocks(folder: Path, track: Track, times: np.ndarray, scenario: Scenario):
     """The times of the path's knots on the clock of frames at `times`, [s], less the time offset;
     and when that of a recording begins."""
     knots, start = track.times, times[0] if times[0] > EPOCH else 0.0
@@ -386,7 +390,7 @@ def _clocks(name: str, track: Track, times: np.ndarray, scenario: Scenario):
     first, last = times[0] + scenario.time_offset, times[-1] + scenario.time_offset
     if last < knots[0] or first > knots[-1]:
         raise ValueError(
-            f"recording {name}: the frames go from {first:g} to {last:g} s, the gripper's path "
+            f"{folder}: the frames go from {first:g} to {last:g} s, the gripper's path "
             f"from {knots[0]:g} to {knots[-1]:g} s: they are not on one clock; give their "
             "difference as time_offset [s]"
         )

@@ -102,7 +102,11 @@ def load_trajectory(path: Path | str) -> SimulatedCloth:
             f"{path}: expected x (frame, vertex, 3) [m] and faces (face, 3), found {x.shape} and "
             f"{faces.shape}"
         )
-    if faces.dtype.kind not in "iu" or faces.min(initial=0) < 0 or faces.max() >= x.shape[1]:
+    if (
+        faces.dtype.kind not in "iu"
+        or faces.min(initial=0) < 0
+        or faces.max(initial=0) >= x.shape[1]
+    ):
         raise ValueError(f"{path}: faces must be numbers of the {x.shape[1]} vertices")
     return SimulatedCloth(x, faces)
 

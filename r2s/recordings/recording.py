@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r2s._util.files import parse, read_npz, write_npz
+from r2s._util.files import parse, read_npz, shown, write_npz
 from r2s._util.units import positive
 from r2s.recordings.clouds import draw_points, numbers, voxel_means
 from r2s.recordings.views import CameraFit, Views
@@ -371,13 +371,14 @@ def load(path: Path | str) -> Recording:
     Raises FileNotFoundError, or a ValueError that names the file and what is wrong with it.
     """
     try:
-        stored = read_npz(path, "meta", "points", "offsets", "times")
+        stored = read_npz(path, "meta", "points", "offsets", "times", text="meta")
         # "handle" was the gripper before 0.4
         arrays = {name.replace("handle_", "gripper_"): part for name, part in stored.items()}
         meta = json.loads(str(arrays["meta"]))
-        if meta["format"] not in READABLE:
+        form = meta.get("format") if isinstance(meta, dict) else meta
+        if form not in READABLE:
             raise ValueError(
-                f"format {meta['format']!r}, expected one of {READABLE}: update r2s, or convert "
+                f"format {shown(form)}, expected one of {READABLE}: update r2s, or convert "
                 "the recording again"
             )
         return make_recording(
@@ -388,14 +389,15 @@ def load(path: Path | str) -> Recording:
             parse(RecordingInfo, meta["info"], "info"),
             **{name: arrays[name] for name in OPTIONAL if name in arrays},
         )
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, RecursionError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else f"{error}"
         raise ValueError(f"{path}: not a readable recording ({FORMAT}): {reason}") from error
 
 
 def _split(points: np.ndarray, offsets: np.ndarray) -> list[np.ndarray]:
     ends = [0, len(points)]
-    if offsets.ndim != 1 or list(offsets[[0, -1]]) != ends or (np.diff(offsets) < 0).any():
+    numbered = offsets.ndim == 1 and offsets.size and offsets.dtype.kind in "iu"
+    if not numbered or list(offsets[[0, -1]]) != ends or (np.diff(offsets) < 0).any():
         raise ValueError(f"offsets must go from {ends[0]} to {ends[1]}, found {offsets}")
     return np.split(points, offsets[1:-1])
 

@@ -14,9 +14,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import KDTree
 
-from r2s._util.checks import expect
+from r2s._util.checks import SHOWN, expect
 from r2s._util.extras import require
-from r2s.recordings.clouds import Corner, connected_pieces, draw_points, read_values, voxel_means
+from r2s.recordings.clouds import (
+    Corner,
+    connected_pieces,
+    draw_points,
+    open_pcd,
+    read_values,
+    voxel_means,
+)
 from r2s.recordings.recording import CORNERS, SheetPlacement, corner, interpolated
 
 FATES = ("outside", "table", "other colour", "gripper", "arm", "other pieces", "cloth")
@@ -305,19 +312,34 @@ def _extent(points: Points, grippers: Grippers, sheet: SheetPlacement) -> tuple[
 
 def read_colours(path: Path) -> Colours:
     """The colours of the points of a ply or pcd file; ValueError that names it without."""
+    try:
+        colours = _colours(path)
+    except (FileNotFoundError, ImportError):
+        raise
+    except Exception as error:  # as in `read_values`
+        words = f"{path}: its colours cannot be read: {str(error)[:SHOWN]}: copy it again"
+        raise ValueError(words) from error
+    if not len(colours):
+        raise ValueError(
+            f"{path}: its points have no colours: write ply or pcd with red, green and blue, or "
+            "leave out the colour of the segmentation"
+        )
+    values = read_values(path)
+    if len(colours) != len(values):
+        raise ValueError(f"{path}: {len(values)} points, but {len(colours)} colours: copy it again")
+    has_return = np.isfinite(values).any(axis=1)  # the others are no points
+    return np.asarray(colours)[has_return, :3].astype(np.uint8)
+
+
+def _colours(path: Path) -> Any:
+    """The colours of all points of a ply or pcd file; none where it has none."""
     colours: Any = ()
     if path.suffix.lower() == ".ply":
         trimesh = require("trimesh", "study", f"{path}: clouds in ply files")
         visual = trimesh.load(path, process=False).visual
         colours = visual.vertex_colors if visual.kind == "vertex" else ()  # else it makes up grey
     elif path.suffix.lower() == ".pcd":
-        cloud = require("pypcd4", "pcd", f"{path}: clouds in pcd files").PointCloud.from_path(path)
+        cloud = open_pcd(path)
         names = [name for name in ("rgb", "rgba") if name in cloud.fields]
-        colours = cloud.decode_rgb(cloud.pc_data[names[0]].copy()) if names else ()
-    if not len(colours):
-        raise ValueError(
-            f"{path}: its points have no colours: write ply or pcd with red, green and blue, or "
-            "leave out the colour of the segmentation"
-        )
-    has_return = np.isfinite(read_values(path)).any(axis=1)  # the others are no points
-    return np.asarray(colours)[has_return, :3].astype(np.uint8)
+        colours = cloud.decode_rgb(np.atleast_1d(cloud.pc_data[names[0]]).copy()) if names else ()
+    return colours

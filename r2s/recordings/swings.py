@@ -99,7 +99,7 @@ def bar_path(
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     stored = read_npz(path, *ARRAYS)
-    points, frames, samples = stored["points"], len(stored["times"]), len(stored["tool_times"])
+    points, frames, samples = stored["points"], stored["times"].size, stored["tool_times"].size
     if points.ndim != 4 or len(points) != frames or points.shape[3] != 3:
         raise ValueError(
             f"points must be ({frames}, along the bar, down, 3) [m], found {points.shape}"

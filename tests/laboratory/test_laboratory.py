@@ -515,7 +515,7 @@ def test_a_straight_line_under_pretension_is_as_stiff_as_without():
         ({"cantilevers": [{"direction": 45, "overhangs": [0.05]}]}, "0 to pi rad"),
         ({"cantilevers": [{"direction": "up", "overhangs": [0.05]}]}, "direction: expected"),
         ({"cantilevers": [{"overhangs": [0.05]}]}, "missing: direction"),
-        ({"cantilevers": [{"direction": "warp", "overhangs": [10**400]}]}, "too large"),
+        ({"cantilevers": [{"direction": "warp", "overhangs": [10**400]}]}, "a finite number"),
         ({"drapes": [{"coefficient": 42}]}, "drape 1: .*per cent"),
         ({"drapes": [{"coefficient": 0.4, "support_radius": 0.18}]}, "diameters"),
     ],
