@@ -144,6 +144,8 @@ def json_file(data: bytes, rng: Random) -> bytes:
         value = json.loads(data)
     except ValueError:  # it was damaged before
         return text(data, rng)
+    if not isinstance(value, dict | list):
+        return text(data, rng)
     return json.dumps(odd_json(value, rng)).encode()
 
 

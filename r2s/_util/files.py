@@ -21,6 +21,7 @@ import numpy as np
 from r2s._util.checks import SHOWN, expect_value
 
 T = TypeVar("T")
+LONGEST = 1000  # characters of an error
 # or a string, which may look like one
 COMMENT = re.compile(r'("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/', re.DOTALL)
 
@@ -195,5 +196,5 @@ def _read_fields(kind: Any, value: Any, where: str) -> Any:
     read = {name: parse(fields[name].type, v, f"{where}: {name}") for name, v in value.items()}
     try:
         return kind(**read)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
+    except (ValueError, OverflowError) as error:  # also of whole numbers beyond 64 bits
+        raise ValueError(f"{where}: {str(error)[:LONGEST]}") from error

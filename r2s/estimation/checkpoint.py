@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from r2s._util.files import SHOWN, shown, write_bytes
+from r2s._util.checks import SHOWN, shown
+from r2s._util.files import write_bytes
 
 FORMAT = "r2s-checkpoint/1"
 HEADER = "checkpoint"  # the array that holds the JSON text

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from r2s._util.files import shown
+from r2s._util.checks import shown
 from r2s.materials.fabric import Fabric
 from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
 from r2s.materials.parameters import UNIFORM_DEVIATION, ParameterSpace, Range

@@ -28,9 +28,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from r2s._util.checks import expect
+from r2s._util.checks import expect, shown
 from r2s._util.extras import require
-from r2s._util.files import load_json, parse, shown
+from r2s._util.files import load_json, parse
 from r2s.laboratory.bending import DRAPE_DEVIATION, RADII, Cantilever, Drape
 from r2s.laboratory.estimate import Test
 from r2s.laboratory.pull import SPECIMEN, Pull

@@ -14,8 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from r2s._util.checks import SHOWN
 from r2s._util.extras import require
-from r2s._util.files import SHOWN
 
 MOST_NUMBERS = 10_000  # of a point, in a field of a PCD
 

@@ -9,7 +9,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from r2s._util.files import load_json, read_json, shown
+from r2s._util.checks import shown
+from r2s._util.files import load_json, read_json
 from r2s.recordings.clouds import read_values
 from r2s.recordings.manifest import (
     Manifest,

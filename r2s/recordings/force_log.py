@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 
-from r2s._util.files import shown
+from r2s._util.checks import shown
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "sec": 1.0}
 NEWTONS = {"N": 1.0, "mN": 1e-3, "cN": 1e-2, "kN": 1e3}
@@ -207,9 +207,8 @@ def _column(
             "shows grams (1 gf = 9.80665 mN): name the column force_gf if it does"
         )
     known = [f"{', '.join(units)} as '{n} [{next(iter(units))}]'" for n, units in choice.items()]
-    raise ValueError(
-        f"{path}: the unit of {header[index]!r} is not known: write one of {' or '.join(known)}"
-    )
+    title = shown(header[index])
+    raise ValueError(f"{path}: the unit of {title} is not known: write one of {' or '.join(known)}")
 
 
 def _bare(unit: str) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Num, UInt8
 
 from r2s._util.extras import require
-from r2s._util.files import write_bytes
+from r2s._util.files import SHOWN, write_bytes
 from r2s.recordings.clocks import find_frames
 from r2s.recordings.clouds import read_values
 
@@ -65,6 +65,9 @@ def _video(path: Path) -> Iterator[tuple[Path, np.ndarray]]:
             number += 1
             image = frame[1]
             yield path, image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    except cv2.error as error:
+        words = f"{path}: frame {number} cannot be read: {str(error)[:SHOWN]}"
+        raise ValueError(f"{words}: it is damaged; copy it again") from error
     finally:
         capture.release()
     if number < max(promised - 1, 1):  # some containers count one frame too many

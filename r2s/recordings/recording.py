@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r2s._util.files import parse, read_npz, shown, write_npz
+from r2s._util.checks import shown
+from r2s._util.files import parse, read_npz, write_npz
 from r2s._util.units import positive
 from r2s.recordings.clouds import draw_points, numbers, voxel_means
 from r2s.recordings.views import CameraFit, Views
@@ -395,10 +396,14 @@ def load(path: Path | str) -> Recording:
 
 
 def _split(points: np.ndarray, offsets: np.ndarray) -> list[np.ndarray]:
+    if points.ndim != 2:
+        raise ValueError(f"points must have the shape (point, 3), found {points.shape}")
     ends = [0, len(points)]
     numbered = offsets.ndim == 1 and offsets.size and offsets.dtype.kind in "iu"
     if not numbered or list(offsets[[0, -1]]) != ends or (np.diff(offsets) < 0).any():
-        raise ValueError(f"offsets must go from {ends[0]} to {ends[1]}, found {offsets}")
+        raise ValueError(
+            f"offsets must go from {ends[0]} to {ends[1]}, found {shown(offsets.tolist())}"
+        )
     return np.split(points, offsets[1:-1])
 
 

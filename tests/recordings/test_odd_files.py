@@ -85,6 +85,7 @@ ODD = [
     ("a.npz", recording(meta=DEEP), load, "recursion"),
     ("a.npz", recording(meta=json.dumps(META), offsets=np.zeros(0)), load, "offsets"),
     ("a.npz", recording(meta=json.dumps(META), offsets=np.array([0.0, 2.0])), load, "offsets"),
+    ("a.npz", recording(meta=json.dumps(META), points=np.zeros(())), load, "points must have"),
     ("a.npz", recording(points=np.zeros(3, [("x", "f4")])), load, "points: expected numbers"),
     ("a.npz", arrays(x=np.array("text"), faces=[[0, 1, 2]]), load_trajectory, "x: expected numb"),
     ("a.npz", arrays(x=np.zeros((1, 0, 3)), faces=[[0, 1, 2]]), load_trajectory, "faces must be"),
