@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from r2s._util.checks import expect
 from r2s._util.extras import require
+from r2s._util.files import SHOWN, shown
 from r2s.mesh.mesh import Mesh, rectangle
 
 FORMATS = ".obj", ".ply", ".off", ".stl", ".gltf", ".glb"
@@ -118,7 +119,8 @@ def _read(path: Path, trimesh: Any, uv: bool) -> tuple[np.ndarray, np.ndarray | 
             faces, texture = np.reshape(loaded.faces, (-1, 3)), getattr(loaded.visual, "uv", None)
             places = np.array(loaded.vertices, float).reshape(-1, 3)
         except Exception as error:  # trimesh raises anything, from KeyError to its own types
-            raise ValueError(f"is no {kind[1:]} file: {error!r}: export it again") from error
+            words = f"is no {kind[1:]} file: {shown(error)}: export it again"
+            raise ValueError(words) from error
         first, second = np.array_split(faces, 2)  # so trimesh cuts quadrilaterals
         if kind not in SPLIT and np.array_equal(first[:, [0, 2]], second[:, [2, 0]]):
             faces = np.column_stack([first, second[:, 1]])
@@ -152,7 +154,8 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray | None, Any]:
             else:
                 table[kind].append(np.array([*words, "0"][:size], float))
         except ValueError as error:
-            raise ValueError(f"line {number}, {line.strip()[:50]!r}: {error}") from None
+            words = f"line {number}, {line.strip()[:50]!r}: {str(error)[:SHOWN]}"
+            raise ValueError(words) from None
     textured = table["vt"] and all(np.all(face[:, 1] >= 0) for face in table["f"])
     texture = np.array(table["vt"]) if textured else None
     return np.array(table["v"]).reshape(-1, 3), texture, table["f"]
