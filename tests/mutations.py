@@ -142,7 +142,7 @@ def json_file(data: bytes, rng: Random) -> bytes:
         return rng.choice((b"[" * deep, b'{"a":' * deep, b"[" * deep + b"]" * deep, b"null", b"3"))
     try:
         value = json.loads(data)
-    except ValueError:  # it was damaged before
+    except (ValueError, RecursionError):  # it was damaged before
         return text(data, rng)
     if not isinstance(value, dict | list):
         return text(data, rng)
