@@ -25,7 +25,7 @@ from conftest import most_memory  # noqa: E402
 from fuzzed_files import KINDS, Kind  # noqa: E402
 from mutations import mutated  # noqa: E402
 
-COUNT = int(os.environ.get("R2S_FUZZED", "500"))  # damaged files of each kind
+COUNT = int(os.environ.get("R2S_FUZZED", "5000"))  # damaged files of each kind
 LONGEST = 10.0  # [s] to read one
 MOST_MEMORY = 2000.0  # [MB]
 LONGEST_ERROR = 2000  # characters
