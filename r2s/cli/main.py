@@ -1,11 +1,13 @@
 """The command line `r2s`: data, pictures, plans, simulations, estimates. `r2s --help` begins.
 
-Exit codes: 0; 1 for an error, in one line on stderr; 2 for wrong usage. The commands are in
+Exit codes: 0; 1 for an error, 2 for wrong usage, in one line on stderr. The commands are in
 `r2s.cli`.
 """
 
+import contextlib
 import gc
 import inspect
+import io
 import os
 import sys
 import warnings
@@ -19,6 +21,7 @@ except ImportError:
     sys.exit("r2s: error: the command line needs tyro: pip install 'r2s[cli]'")
 
 from r2s import compilation
+from r2s.cli import usage
 from r2s.cli.checks import CheckGrad, Doctor
 from r2s.cli.estimate import EstimateCard
 from r2s.cli.evaluate import Evaluate
@@ -56,17 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"r2s {version()}")
         return 0
     try:
-        command = tyro.cli(
-            _choice(is_list=not set(arguments) & set(COMMANDS)),
-            prog="r2s",
-            description=(
-                "r2s: real-to-sim for fabrics. Each command tells more with --help. Compiled "
-                "programs are kept in the cache folder of the user, or in that of "
-                f"JAX_COMPILATION_CACHE_DIR; {NO_CACHE}, with any command, keeps and reads none."
-            ),
-            args=[each for each in arguments if each != NO_CACHE],
-            config=(OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff),
-        )
+        command = _parse([each for each in arguments if each != NO_CACHE])
         with warnings.catch_warnings():
             warnings.showwarning = _warn
             return command.run() or 0
@@ -84,6 +77,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("r2s: error: interrupted", file=sys.stderr)
         return 1
     return 0
+
+
+def _parse(arguments: Sequence[str]) -> Any:
+    """The command with its arguments; SystemExit after help, and after one line on wrong usage."""
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
+            return _tyro(arguments)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+    first = arguments[: 2 if arguments[:1] == ["data"] else 1]
+    names = [each for each in first if not each.startswith("-")]
+    wrong = usage.explain(_told(arguments), arguments, _told([*names, "--help"]))
+    print(f"r2s: error: {wrong}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def _told(arguments: Sequence[str]) -> str:
+    """What tyro prints before it ends the program; without a terminal there are no boxes."""
+    told = io.StringIO()
+    with (
+        contextlib.redirect_stdout(told),
+        contextlib.redirect_stderr(told),
+        contextlib.suppress(SystemExit),
+    ):
+        _tyro(arguments)
+    return told.getvalue()
+
+
+def _tyro(arguments: Sequence[str]) -> Any:
+    return tyro.cli(
+        _choice(is_list=not set(arguments) & set(COMMANDS)),
+        prog="r2s",
+        description=(
+            "r2s: real-to-sim for fabrics. Each command tells more with --help. Compiled "
+            "programs are kept in the cache folder of the user, or in that of "
+            f"JAX_COMPILATION_CACHE_DIR; {NO_CACHE}, with any command, keeps and reads none."
+        ),
+        args=arguments,
+        config=(OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff),
+    )
 
 
 def _choice(is_list: bool) -> Any:

@@ -408,8 +408,13 @@ def _with_prior(problems: Problems, losses: np.ndarray, nuisances: np.ndarray) -
     return np.where(np.isfinite(losses), losses + penalty, DIVERGED)
 
 
-METHODS: dict[str, type[Method]] = {
-    method.name: method
+class _Methods(dict[str, type[Method]]):
+    def __missing__(self, name: str) -> type[Method]:
+        raise KeyError(f"no method {name!r}; there are {', '.join(self)}")
+
+
+METHODS = _Methods(
+    (method.name, method)
     for method in (
         DiffCloud,
         DiffCP,
@@ -421,5 +426,5 @@ METHODS: dict[str, type[Method]] = {
         PublishedPhysNet,
         PublishedPINN,
     )
-}
-"""All methods by name, for the command line and the study."""
+)
+"""All methods by name, for the command line and the study; a `KeyError` names them."""

@@ -43,6 +43,12 @@ def test_the_command_line_offers_every_method_and_no_other():
     assert all(set(method.budget_fields) <= set(Budget._fields) for method in METHODS.values())
 
 
+def test_a_method_that_does_not_exist_names_those_that_do():
+    with pytest.raises(KeyError, match="no method 'difcloud'; there are diffcloud, diffcp, "):
+        METHODS["difcloud"]
+    assert "difcloud" not in METHODS and METHODS.get("difcloud") is None
+
+
 @pytest.mark.parametrize(
     "name, solver, number, words",
     [
