@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from r2s._util.checks import expect
+from r2s._util.checks import SHOWN, expect, shown
 from r2s._util.extras import require
-from r2s._util.files import SHOWN, shown
 from r2s.mesh.mesh import Mesh, rectangle
 
 FORMATS = ".obj", ".ply", ".off", ".stl", ".gltf", ".glb"

@@ -77,7 +77,7 @@ def test_a_frame_shows_what_the_cameras_that_took_it_see():
             in_view(views, both, NOBODY, jnp.array(taken)), in_view(alone, both, NOBODY)
         )
         seen = [observed(each, sheet(0.0), FACES, n) for each, n in ((views, frame), (alone, 0))]
-        np.testing.assert_array_equal(*seen)
+        np.testing.assert_array_equal(seen[0], seen[1])
 
 
 def test_the_workspace_less_its_border_is_what_counts():
