@@ -59,9 +59,11 @@ def write_bytes(path: Path | str, data: bytes) -> None:
 
 
 def check_folders(*paths: Path | None) -> None:
-    """Raise `FileNotFoundError` where the folder of a file that will be written is missing: before
-    the work of making what is in it."""
+    """Raise `FileNotFoundError` where the folder of a file that will be written is missing, and
+    `IsADirectoryError` where the file is a folder: before the work of making what is in it."""
     for path in paths:
+        if path is not None and path.is_dir():
+            raise IsADirectoryError(f"{path}: this is a folder; name a file to write")
         if path is not None and not path.absolute().parent.is_dir():
             raise FileNotFoundError(f"{path}: there is no folder {path.parent} to write it to")
 
@@ -103,7 +105,8 @@ def read_npz(path: Path | str, *needed: str, text: str = "") -> dict[str, np.nda
     except FileNotFoundError:
         raise
     except Exception as error:  # a damaged archive raises anything, from EOFError to zlib.error
-        words = str(error)[:SHOWN]
+        # NumPy takes what is no archive for a pickle
+        words = "no NPZ" if "allow_pickle" in str(error) else str(error)[:SHOWN]
         raise ValueError(f"{words}: copy the file again, or make it anew") from error
     if lacking := [name for name in needed if name not in arrays]:
         raise ValueError(f"lacks the arrays {', '.join(lacking)}; has {', '.join(arrays)}")

@@ -262,6 +262,10 @@ class EstimateCard:
                 takes = ", ".join(f"--{each}" for each in method.budget_fields)
                 words = f"--{name} is not of {method.name}: it takes {takes}"
                 raise ValueError(words.replace("_", "-"))
+            least = 0 if name == "num_samples" else 1
+            if asked[name] < least:
+                words = f"--{name} must be at least {least}, got {asked[name]}"
+                raise ValueError(words.replace("_", "-"))
         return method.budget._replace(**asked)
 
 

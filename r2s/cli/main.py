@@ -67,8 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout = None
     except (ValueError, OSError, ImportError, RuntimeError, MemoryError) as error:
         message = " ".join(str(error).split())
-        if isinstance(error, OSError) and error.filename and error.strerror:  # no "[Errno 2]"
-            message = f"{error.filename}: {error.strerror}"
+        if isinstance(error, OSError) and error.strerror:  # no "[Errno 2]"
+            message = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
         if "RESOURCE_EXHAUSTED" in message:
             message += " Take fewer frames, shorter motions or a coarser mesh."
         print(f"r2s: error: {message}", file=sys.stderr)

@@ -8,7 +8,7 @@ from tyro.conf import Positional, arg
 
 from r2s.cli.common import ChosenShape, FabricName, Json, Motion, Scenario, Shape
 
-SMALL = 5e-4  # an error of an energy that is printed as 0.0%
+SMALL = 0.01  # an error of an energy that has no consequence
 TINY = 1e-3  # least ratio of energies whose inverse is printed
 
 
@@ -135,13 +135,14 @@ class Sensitivity:
     json: Json = False
 
     def run(self) -> None:
-        from r2s.cli.common import mesh_warning, parse_numbers, print_result
+        from r2s.cli.common import make_experiment, mesh_warning, parse_numbers, print_result
         from r2s.estimation.estimate import as_json
         from r2s.estimation.judgement import evaluate_design
         from r2s.estimation.method import COARSEST
         from r2s.estimation.summary import describe
         from r2s.scenarios.standard import SIDE
 
+        make_experiment(self.scenario, self.motion)  # its errors are those of the other commands
         numbers = parse_numbers(self.motion)
         design = evaluate_design(self.scenario, self.fabric, numbers, self.noise, self.seed)
         coarse = mesh_warning(COARSEST, design.fabric, (SIDE, SIDE), self.scenario)
@@ -149,7 +150,7 @@ class Sensitivity:
 
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from r2s.export.stiffness import Loss
     from r2s.materials.fabric import Fabric
@@ -182,8 +183,10 @@ class Export:
     json: Json = False
 
     def run(self) -> int:
+        from r2s._util.files import check_folders
         from r2s.cli.common import load_card, mesh_warning, print_result
 
+        check_folders(self.out)
         card = load_card(self.fabric)
         loss = self._write(card.fabric, card.name)
         result = {
@@ -193,17 +196,27 @@ class Export:
             "relative_energy_error": {"membrane": loss.membrane, "bending": loss.bending},
             "lost": loss.lost,
         }
-        lines = [f"{self.out}: {card.name} for {self.to}"]
-        for part in ("membrane", "bending"):
-            errors = getattr(loss, part).items()
-            if errors:
-                errors = ", ".join(f"{name} {e:+.1%}" for name, e in errors)
-                lines.append(f"{part}, error of the energy: {errors}")
-                lines += _consequence(part, getattr(loss, part))
+        lines = [f"{self.out}: {card.name} for {self.to}", *self._consequences(loss)]
         if self.to != "arcsim":
             lines += mesh_warning(self.shape, card.fabric, self.size, "lifting")
         print_result(self.json, result, [*lines, *(f"lost: {text}" for text in loss.lost)])
         return 0
+
+    def _consequences(self, loss: "Loss") -> "Iterator[str]":
+        """What errors of the energy do to a motion, and what helps; nothing of small ones."""
+        if max(map(abs, loss.membrane.values())) > SMALL:
+            farther = {name: 1 / max(1 + error, TINY) for name, error in loss.membrane.items()}
+            advice = "a motion under its own weight hardly shows it"
+            if self.isotropic:
+                advice += "; without --isotropic it is nearer"
+            yield f"the same force stretches it {_range(farther)} times as far: {advice}"
+        if max(map(abs, loss.bending.values()), default=0.0) > SMALL:
+            # a bending length grows as the cube root (Peirce 1930)
+            wider = {name: (1 + error) ** (1 / 3) for name, error in loss.bending.items()}
+            yield (
+                f"folds are {_range(wider)} times as wide: the mesh's diagonals bend too stiffly; "
+                "a mesh with alternating ones is nearer (docs/guide/export.md)"
+            )
 
     def _write(self, fabric: "Fabric", name: str) -> "Loss":
         from r2s._util.files import write_json, write_text
@@ -232,12 +245,6 @@ class Export:
         return loss
 
 
-def _consequence(part: str, errors: "Mapping[str, float]") -> list[str]:
-    """What the largest error of an energy does to the exported sheet."""
-    name, worst = max(errors.items(), key=lambda pair: abs(pair[1]))
-    if abs(worst) < SMALL:
-        return []
-    ratio = max(1 + worst, TINY)
-    if part == "bending":  # a bending length grows as the cube root (Peirce 1930)
-        return [f"    so folds are {ratio ** (1 / 3):.2f} times as wide in that direction ({name})"]
-    return [f"    so the same force stretches it {1 / ratio:.3g} times as far ({name})"]
+def _range(ratios: "Mapping[str, float]") -> str:
+    least, most = min(ratios, key=ratios.__getitem__), max(ratios, key=ratios.__getitem__)
+    return f"{ratios[least]:.3g} ({least}) to {ratios[most]:.3g} ({most})"

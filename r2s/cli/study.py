@@ -76,6 +76,11 @@ class Study:
         from r2s.study import plan as plans
         from r2s.study.ensembles import ensembles
 
+        if self.workers < 1 or self.slurm < 0:
+            raise ValueError(
+                f"--workers must be at least 1 and --slurm at least 0, got {self.workers} and "
+                f"{self.slurm}"
+            )
         plan = plans.with_changes(
             plans.PRESETS[self.preset],
             list(chain(*self.configurations)),

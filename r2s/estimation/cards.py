@@ -177,7 +177,9 @@ def from_json(stored: Any) -> Card:
     """The card that `as_json` made, or version 0.2.0; `ValueError` names the key that is wrong."""
     form = stored.get("format") if isinstance(stored, dict) else type(stored).__name__
     if form not in (FORMAT, FORMAT_0_2):
-        raise ValueError(f"no fabric card: format must be {FORMAT!r}, found {form!r}")
+        raise ValueError(
+            f"no fabric card: format must be {FORMAT!r}, found {form!r}; r2s estimate writes one"
+        )
     check_keys(stored, KEYS, "")
     for name in ("name", "precision"):
         expect(isinstance(stored[name], str), name, "text", stored[name])

@@ -195,7 +195,7 @@ def rectangle(
     >>> sheet.rest.shape, sheet.faces.shape
     ((12, 2), (12, 3))
     """
-    if min(size) <= 0 or min(shape) < 2:
+    if not all(0 < side < np.inf for side in size) or min(shape) < 2:
         raise ValueError(f"a rectangle needs sides > 0 m and >= 2 vertices, got {size}, {shape}")
     rows, columns = shape
     warp, weft = np.meshgrid(

@@ -402,7 +402,8 @@ def _split(points: np.ndarray, offsets: np.ndarray) -> list[np.ndarray]:
     numbered = offsets.ndim == 1 and offsets.size and offsets.dtype.kind in "iu"
     if not numbered or list(offsets[[0, -1]]) != ends or (np.diff(offsets) < 0).any():
         raise ValueError(
-            f"offsets must go from {ends[0]} to {ends[1]}, found {shown(offsets.tolist())}"
+            f"offsets must rise from 0 to the number of points, {ends[1]}, one more than frames, "
+            f"found {shown(offsets.tolist())}"
         )
     return np.split(points, offsets[1:-1])
 
