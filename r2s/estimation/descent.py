@@ -31,7 +31,7 @@ from r2s.estimation.gauss_newton import (
     propose,
     remaining,
 )
-from r2s.estimation.least_squares import Damping
+from r2s.estimation.least_squares import INITIAL_DAMPING, Damping
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import (
     Derive,
@@ -59,8 +59,8 @@ class Stop(NamedTuple):
 
     - `close`: when the predicted gain of its next step over the prior's weight is less; two are
       about a change by one standard error.
-    - `patience`, `gain`: when so many steps gained less than that, or than this share of the loss.
-    - `stuck`: at this damping: not even so short a step lowers the loss.
+    - `patience`, `gain`: when so many trials gained less than that, or than this share of the loss.
+    - `stuck`: when a step fails at this damping: not even so short a step lowers the loss.
     """
 
     close: float
@@ -71,8 +71,8 @@ class Stop(NamedTuple):
 
 # At a tenth of a standard error; or, where another descent starts there, at a quarter (a half is
 # too early: the outliers of then may hold it there); or, where more frames follow, roughly.
-AT_THE_END, ON_THE_WAY = Stop(5e-3, 4, 5e-4, 1.0), Stop(0.03, 2, 3e-3, 0.1)
-MORE_FRAMES = Stop(0.03, 2, 0.02, 0.02)
+AT_THE_END, ON_THE_WAY = Stop(5e-3, 6, 5e-4, 1.0), Stop(0.03, 3, 3e-3, 0.1)
+MORE_FRAMES = Stop(0.03, 2, 0.02, 0.0)
 ONE_ERROR = 0.5  # predicted gain over the prior's weight, of a step of one standard error
 Iteration = list[Descent]  # one iteration: the descents of all starts
 Linear = dict[int, Predicted]  # motions and slopes at the places of an iteration, by start
@@ -385,28 +385,27 @@ def is_stuck(search: Search) -> bool:
     minimum is more than a standard error away."""
     best, prior = search.best, prior_weight(search.problems, search.best.normal)
     is_far = float(remaining(search.problems, best, prior)) > ONE_ERROR * float(prior)
-    return float(best.damping) >= AT_THE_END.stuck and is_far
+    return float(best.damping) > INITIAL_DAMPING and is_far
 
 
 def _arrived(problems: Problems, stage: list[Iteration], start: int, prior, stop: Stop) -> bool:
-    """Whether a descent is at its end by a criterion of `stop`, or diverged. Rejected steps do not
-    count: the next is shorter, and may lower the loss."""
+    """Whether a descent is at its end by a criterion of `stop`, or diverged."""
     now = stage[-1][start]
-    if not np.isfinite(now.normal.loss) or float(now.damping) >= stop.stuck:
+    if not np.isfinite(now.normal.loss):
+        return True
+    has_failed = len(stage) > 1 and np.array_equal(now.theta, stage[-2][start].theta)
+    if has_failed and float(now.damping) >= stop.stuck:
         return True
     least = stop.close * float(prior)
     if len(stage) > 1 and float(remaining(problems, now, prior)) < least:
         return True
-    before = [
-        row[start]
-        for row, after in itertools.pairwise(stage)
-        if not np.array_equal(row[start].theta, after[start].theta)
-    ]
-    if len(before) < stop.patience:
+    tried = [i for i, row in enumerate(stage) if i and int(row[start].age)]
+    if len(tried) < stop.patience:
         return False
+    before = stage[tried[-stop.patience] - 1][start]
     old, new = (
         float(objective(problems, descent.theta, descent.normal.loss, prior))
-        for descent in (before[-stop.patience], now)
+        for descent in (before, now)
     )
     return not new < old - max(least, stop.gain * float(now.normal.loss))
 
