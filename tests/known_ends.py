@@ -56,7 +56,7 @@ def end_at(theta, loss: Any = 0.0, gradient: Any = 0.0, matrix: Any = 0.0, scale
     square = jnp.zeros((len(theta), len(theta)))
     gradient, matrix = jnp.zeros(len(theta)) + gradient, square + matrix
     normal = Normal(jnp.asarray(loss, float), zero, zero, gradient, matrix, square)
-    return Descent(theta, normal, zero, zero, jnp.asarray(scale, float), *[jnp.zeros((), int)] * 2)
+    return Descent(theta, normal, zero, zero, jnp.asarray(scale, float), jnp.zeros((), int))
 
 
 def valley(lifted, size):
@@ -72,4 +72,4 @@ def valley(lifted, size):
         return Normal(loss * one, one, one, found, matrix, 1e-4 * matrix)
 
     one = jnp.ones(())
-    return Descent(end, at(end), one, one, one, *[jnp.zeros((), int)] * 2), at
+    return Descent(end, at(end), one, one, one, jnp.zeros((), int)), at

@@ -1,10 +1,5 @@
-"""The search for the best fabric: coarse sampling, then Gauss-Newton descents.
+"""The search for the best fabric: coarse sampling, then Gauss-Newton descents."""
 
-A descent begins every stage with exact derivatives. Its steps are single motions then, and change
-the derivatives by secants, until a step fails or the end must be confirmed.
-"""
-
-import dataclasses
 import itertools
 import time
 from pathlib import Path
@@ -15,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s._util.threads import thread_map
 from r2s.compilation import clear_in_time
 from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation.gauss_newton import (
@@ -24,24 +18,19 @@ from r2s.estimation.gauss_newton import (
     Normal,
     accept,
     losses_at,
-    normal_from,
     normals_at,
     objective,
     prior_weight,
     propose,
     remaining,
 )
-from r2s.estimation.least_squares import INITIAL_DAMPING, Damping
+from r2s.estimation.least_squares import Damping
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import (
     Derive,
-    Predicted,
-    Prediction,
     Theta,
     explain,
     fabric_at,
-    predictions_at,
-    secant,
     theta_indices,
     theta_length,
 )
@@ -59,8 +48,8 @@ class Stop(NamedTuple):
 
     - `close`: when the predicted gain of its next step over the prior's weight is less; two are
       about a change by one standard error.
-    - `patience`, `gain`: when so many trials gained less than that, or than this share of the loss.
-    - `stuck`: when a step fails at this damping: not even so short a step lowers the loss.
+    - `patience`, `gain`: when so many steps gained less than that, or than this share of the loss.
+    - `stuck`: at this damping: not even so short a step lowers the loss.
     """
 
     close: float
@@ -71,11 +60,10 @@ class Stop(NamedTuple):
 
 # At a tenth of a standard error; or, where another descent starts there, at a quarter (a half is
 # too early: the outliers of then may hold it there); or, where more frames follow, roughly.
-AT_THE_END, ON_THE_WAY = Stop(5e-3, 6, 5e-4, 1.0), Stop(0.03, 3, 3e-3, 0.1)
-MORE_FRAMES = Stop(0.03, 2, 0.02, 0.0)
+AT_THE_END, ON_THE_WAY = Stop(5e-3, 4, 5e-4, 10.0), Stop(0.03, 2, 3e-3, 10.0)
+MORE_FRAMES = Stop(0.03, 2, 0.02, 1.0)
 ONE_ERROR = 0.5  # predicted gain over the prior's weight, of a step of one standard error
 Iteration = list[Descent]  # one iteration: the descents of all starts
-Linear = dict[int, Predicted]  # motions and slopes at the places of an iteration, by start
 DEFAULT = Budget(frame_fractions=(0.25, 0.5))
 
 
@@ -181,9 +169,7 @@ def multi_start(
     if not rows:
         rows = [_begin(problems, run, start)]
     tell(run.progress, words)
-    linear = None
-    while (after := _next(problems, run, rows, linear)) is not None:
-        row, linear = after
+    while (row := _next(problems, run, rows)) is not None:
         rows.append(row)
         if checkpoint is not None:
             checkpoints.save(checkpoint, checkpoints.arrays_of(stacked(rows)), settings)
@@ -239,19 +225,16 @@ def _seen(problems: Problems, budget: Budget, stage: int) -> Problems:
 def _fresh(problems: Problems, run: Run, thetas: list, scale: float, stage: int) -> Iteration:
     """Descents that begin at some thetas, in a stage."""
     damping, limits = Damping.initial(), [jnp.asarray(scale, float)] * len(thetas)
-    seen, at = _seen(problems, run.budget, stage), jnp.asarray(stage)
+    seen = _seen(problems, run.budget, stage)
     normals = normals_at(seen, thetas, limits, run.budget.secant_width, run.derive)
     return [
-        Descent(theta, normal, damping.value, damping.growth, limit, at, jnp.asarray(0))
+        Descent(theta, normal, damping.value, damping.growth, limit, jnp.asarray(stage))
         for theta, normal, limit in zip(thetas, normals, limits, strict=True)
     ]
 
 
-def _next(
-    problems: Problems, run: Run, rows: list[Iteration], linear: Linear | None
-) -> tuple[Iteration, Linear | None] | None:
-    """The next iteration, with the motions and slopes at its places (None: exact ones); None at the
-    end."""
+def _next(problems: Problems, run: Run, rows: list[Iteration]) -> Iteration | None:
+    """The next iteration; None at the end."""
     row, budget = rows[-1], run.budget
     _, best = _best(row)
     now = int(best.stage)
@@ -259,65 +242,18 @@ def _next(
     prior = prior_weight(problems, best.normal)
     stop = _stop(budget, now)
     kept = _kept(row, len(stage))
-    arrived = [i for i in kept if _arrived(problems, stage, i, prior, stop)]
+    moving = [i for i in kept if not _arrived(problems, stage, i, prior, stop)]
     is_passed = budget.warm_start and now < len(_shares(budget)) - 1
-    if is_passed or len(stage) > budget.max_iterations:
-        arrived = kept
-    seen, width = _seen(problems, budget, now), budget.secant_width
-    if linear is None:
-        linear = {i: run.derive(seen, row[i].theta, width) for i in kept if i not in arrived}
-    doubted = [i for i in kept if _is_doubted(stage, i, i in arrived, stop)]
-    after, linear = list(row), dict(linear)
-    if doubted:
-        for i in doubted:
-            linear[i] = run.derive(seen, row[i].theta, width)
-            after[i] = _linearized(seen, row[i], linear[i], age=0)
-        return after, linear
-    moving = [i for i in kept if i not in arrived]
-    if not moving:
-        later = _next_stage(problems, run, row)
-        return None if later is None else (later, None)
+    if is_passed or not moving or len(stage) > budget.max_iterations:
+        return _next_stage(problems, run, row)
+    seen = _seen(problems, budget, now)
     trials = [propose(problems, row[i], prior) for i in moving]
-    motions = thread_map(lambda trial: predictions_at(seen, trial), trials)
-    for i, trial, moved in zip(moving, trials, motions, strict=True):
-        after[i], linear[i] = _stepped(seen, row[i], linear[i], trial, moved, prior)
-    return after, linear
-
-
-def _is_doubted(stage: list[Iteration], start: int, has_arrived: bool, stop: Stop) -> bool:
-    """Whether a descent needs exact derivatives: where secants failed, or say that it is at its
-    end."""
-    now = stage[-1][start]
-    if not int(now.age) or not np.isfinite(now.normal.loss):
-        return False
-    if has_arrived:
-        return stop is AT_THE_END
-    return int(now.age) > 1 and bool(np.array_equal(now.theta, stage[-2][start].theta))
-
-
-def _linearized(problems: Problems, descent: Descent, linear: Predicted, age: int) -> Descent:
-    """A descent with the normal equations of some slopes."""
-    normal = normal_from(problems, descent.theta, linear, descent.scale)
-    return dataclasses.replace(descent, normal=normal, age=jnp.asarray(age))
-
-
-def _stepped(
-    problems: Problems,
-    descent: Descent,
-    linear: Predicted,
-    trial: Theta,
-    moved: list[Prediction],
-    prior,
-) -> tuple[Descent, Predicted]:
-    """A descent after a trial, and its motions and slopes there: secants of those before."""
-    slopes = secant(problems, linear, moved, trial - descent.theta)
-    tried = normal_from(problems, trial, list(zip(moved, slopes, strict=True)), descent.scale)
-    after = accept(problems, descent, trial, tried, prior)
-    if bool(np.array_equal(after.theta, descent.theta)):  # what was refused is known, too
-        moved = [prediction for prediction, _ in linear]
-        linear = list(zip(moved, slopes, strict=True))
-        return _linearized(problems, after, linear, int(after.age)), linear
-    return after, list(zip(moved, slopes, strict=True))
+    scales = [row[i].scale for i in moving]
+    tried = normals_at(seen, trials, scales, budget.secant_width, run.derive)
+    after = list(row)
+    for i, trial, normal in zip(moving, trials, tried, strict=True):
+        after[i] = accept(problems, row[i], trial, normal, prior)
+    return after
 
 
 def _rows_of_stage(rows: list[Iteration], stage: int) -> list[Iteration]:
@@ -385,27 +321,28 @@ def is_stuck(search: Search) -> bool:
     minimum is more than a standard error away."""
     best, prior = search.best, prior_weight(search.problems, search.best.normal)
     is_far = float(remaining(search.problems, best, prior)) > ONE_ERROR * float(prior)
-    return float(best.damping) > INITIAL_DAMPING and is_far
+    return float(best.damping) >= AT_THE_END.stuck and is_far
 
 
 def _arrived(problems: Problems, stage: list[Iteration], start: int, prior, stop: Stop) -> bool:
-    """Whether a descent is at its end by a criterion of `stop`, or diverged."""
+    """Whether a descent is at its end by a criterion of `stop`, or diverged. Rejected steps do not
+    count: the next is shorter, and may lower the loss."""
     now = stage[-1][start]
-    if not np.isfinite(now.normal.loss):
-        return True
-    has_failed = len(stage) > 1 and np.array_equal(now.theta, stage[-2][start].theta)
-    if has_failed and float(now.damping) >= stop.stuck:
+    if not np.isfinite(now.normal.loss) or float(now.damping) >= stop.stuck:
         return True
     least = stop.close * float(prior)
     if len(stage) > 1 and float(remaining(problems, now, prior)) < least:
         return True
-    tried = [i for i, row in enumerate(stage) if i and int(row[start].age)]
-    if len(tried) < stop.patience:
+    before = [
+        row[start]
+        for row, after in itertools.pairwise(stage)
+        if not np.array_equal(row[start].theta, after[start].theta)
+    ]
+    if len(before) < stop.patience:
         return False
-    before = stage[tried[-stop.patience] - 1][start]
     old, new = (
         float(objective(problems, descent.theta, descent.normal.loss, prior))
-        for descent in (before, now)
+        for descent in (before[-stop.patience], now)
     )
     return not new < old - max(least, stop.gain * float(now.normal.loss))
 
@@ -428,12 +365,10 @@ def _resumed(checkpoint: Path, run: dict[str, str], budget: Budget) -> list[Iter
     if arrays is None:
         return []
     none, vector, square = (jnp.zeros((0,) * dims) for dims in (2, 3, 4))
-    count = jnp.zeros((0, 0), int)
     normal = Normal(none, none, none, vector, square, square)
-    like = Descent(vector, normal, none, none, none, count, count)
+    like = Descent(vector, normal, none, none, none, jnp.zeros((0, 0), int))
     stored = checkpoints.tree_from(arrays, like)
-    exact = np.flatnonzero(~np.any(stored.age, axis=1))  # slopes of secants are not kept
     return [
         [jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], stored) for j in range(budget.num_starts)]
-        for i in range(exact[-1] + 1 if len(exact) else 0)
+        for i in range(len(stored.stage))
     ]

@@ -81,7 +81,6 @@ class Descent(eqx.Module):
     - `damping`, `growth`: see `r2s.estimation.least_squares.Damping`.
     - `scale`: of the robust loss, [m], see `r2s.metrics.losses.robust`; 0: no outliers.
     - `stage`: see `max_iterations` of `r2s.estimation.method.Budget`.
-    - `age`: how many secants its derivative has; 0: it is exact.
     """
 
     theta: Float[Array, "*start theta"]
@@ -90,7 +89,6 @@ class Descent(eqx.Module):
     growth: Float[Array, "*start"]
     scale: Float[Array, "*start"]
     stage: Int[Array, "*start"]
-    age: Int[Array, "*start"]
 
 
 def recording_weights(problems: Problems) -> list[Float[Array, ""]]:
@@ -296,7 +294,6 @@ def accept(problems: Problems, descent: Descent, trial: Theta, tried: Normal, pr
         damping.growth,
         descent.scale,
         descent.stage,
-        descent.age + 1,
     )
 
 

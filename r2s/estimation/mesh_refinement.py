@@ -63,11 +63,11 @@ def descend_by_meshes(
       error); not with a `shape`.
     """
     levels = [(shape,) * len(recordings)] if shape else _levels(recordings)
-    problems_on = functools.cache(partial(_problems, recordings, space))
     if finest:
         levels = [levels[0], levels[-1]]
+    problems_on = functools.cache(partial(_problems, recordings, space))
     meshes = _Meshes(recordings, problems_on, run, levels[0])
-    meshes, search = _first(meshes, levels[0], leads_on=len(levels) > 2 or finest)
+    meshes, search = _first(meshes, levels[0], leads_on=len(levels) > 1)
     search, refused = _refined(meshes, search, levels[1:], finest)
     tell(run.progress, "standard errors")
     ratio = 2.0 if refused or _is_finest(search.shapes) else 0.5
@@ -119,11 +119,13 @@ class _Meshes(NamedTuple):
         search = multi_start(self.problems(shapes), run, start=start, words=words)
         return search._replace(shapes=shapes)
 
-    def confirmed(self, search: Search) -> Search:
-        """The best of a search and of others from other starts: of several recordings these begin
-        on the coarsest mesh, where they take a quarter of the time."""
+    def completed(self, search: Search) -> Search:
+        """A search from the end of another, and from other starts: of several recordings these
+        begin on the coarsest mesh, where they take a quarter of the time."""
+        end = self.search(search.shapes, search.theta, leads_on=False)
+        end = end._replace(unsure=search.unsure)
         is_single = len(self.recordings) == 1 or search.shapes == self.coarsest
-        return look_again(search, self.run, None if is_single else self.problems(self.coarsest))
+        return look_again(end, self.run, None if is_single else self.problems(self.coarsest))
 
 
 def _first(meshes: _Meshes, shapes: Shapes, leads_on: bool) -> tuple[_Meshes, Search]:
@@ -141,25 +143,27 @@ def _refined(
 ) -> tuple[Search, str]:
     """The search on meshes that resolve the fabric, and why finer ones were refused, or "".
 
-    Before the last level the search is repeated from other starts.
+    Before the last level the search is completed, which may end at a softer fabric, and repeated
+    from other starts.
     """
-    for number, shapes in enumerate(finer, 1):
-        left = len(finer) - number
-        if not left and not finest:
-            search = meshes.confirmed(search)
+    if not finer:
+        return look_again(search, meshes.run), ""
+    for shapes in finer:
+        is_last = shapes is finer[-1]
+        if is_last and not finest:
+            search = meshes.completed(search)
             if not is_too_coarse(meshes.recordings, search.fabric, search.shapes):
-                return search, ""
+                break
         try:
-            leads_on = left > (0 if finest else 1)
-            on_finer = meshes.search(shapes, search.theta, leads_on)
+            on_finer = meshes.search(shapes, search.theta, leads_on=not is_last)
             search = _continued(search, on_finer, meshes.run)
         except Diverged as error:
             if finest:
                 raise
             tell(meshes.run.progress, f"the finer mesh diverged: back to {_words(search.shapes)}")
-            search = meshes.confirmed(search) if left else search
+            search = search if is_last else meshes.completed(search)
             return search, f"{_words(shapes)} vertices, which it needs: {error}"
-    return (search if finer else look_again(search, meshes.run)), ""
+    return search, ""
 
 
 def _continued(before: Search, finer: Search, run: Run) -> Search:

@@ -206,39 +206,6 @@ def _motions(problems: Problems, theta: Theta) -> list[tuple[Problem, Array]]:
     return [(motion_alone(problem), theta[index]) for problem, index in pairs]
 
 
-def secant(
-    problems: Problems, predicted: Predicted, moved: list[Prediction], change: Theta
-) -> list[Sensitivity]:
-    """Slopes after a motion that is `change` away from a prediction with its slopes.
-
-    The least change of the slopes with which they explain the motion (Broyden 1965), in the
-    parameters that move the sheet; what cameras see of it stays. A diverged motion changes none.
-    """
-    known = []
-    for which, (old, slope) in enumerate(predicted):
-        own = change[theta_indices(problems, which)]
-        known.append(_secant(old, slope, moved[which], own, problems[0].space.dim + len(SHARED)))
-    return known
-
-
-@eqx.filter_jit
-def _secant(
-    old: Prediction, slope: Sensitivity, new: Prediction, change: Theta, moving: int
-) -> Sensitivity:
-    way = jnp.where(jnp.arange(len(change)) < moving, change, 0)
-    square = way @ way
-    way = jnp.where(new.ok & (square > 0), way / jnp.where(square > 0, square, 1), 0)
-
-    def explained(before, after, slope):
-        missed = jnp.where(new.ok, after - before - slope @ change, 0)
-        return slope + jnp.multiply.outer(missed, way)
-
-    force = slope.force
-    if not (force is None or old.force is None or new.force is None):
-        force = explained(old.force, new.force, force)
-    return Sensitivity(explained(old.x, new.x, slope.x), force)
-
-
 def remembering() -> Derive:
     """`derivatives_at` with a cache of the latest places: a stage of a descent, a search and the
     standard errors begin where another ended. Derivatives of more frames serve fewer, too."""

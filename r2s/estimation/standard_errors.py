@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s._util.threads import thread_map
 from r2s.compilation import compile_once
 from r2s.estimation.gauss_newton import (
     MARGIN,
@@ -29,6 +28,7 @@ from r2s.estimation.gauss_newton import (
     least_weight,
     loss_from,
     normal_from,
+    normals_at,
     only_held,
     prior_terms,
     prior_weight,
@@ -154,26 +154,18 @@ def covariance_at(
 ) -> Matrix:
     """`covariance` of theta at the end of a descent, with `budget.num_probes` neighbours.
 
-    The steps from neighbours have their own motions and the end's slopes: what the linear model
-    misses scatters them.
-
     - `tried_on`: the same recordings on the mesh of the neighbours, one standard error of that mesh
       away; None: the mesh of the descent.
     """
     other, start = tried_on or problems, end
-    predicted = derive(other, end.theta, budget.secant_width)
     if other is not problems:
+        predicted = derive(other, end.theta, budget.secant_width)
         start = dataclasses.replace(end, normal=normal_from(other, end.theta, predicted, end.scale))
     apart = jnp.zeros((0, len(end.theta)), float)
     if budget.num_probes:
         weight = prior_weight(other, start.normal)
         places = list(sample_around(other, start, weight, budget.num_probes, key))
-        motions = thread_map(lambda place: predictions_at(other, place), places)
-        slopes = [slope for _, slope in predicted]
-        normals = [
-            normal_from(other, place, list(zip(moved, slopes, strict=True)), end.scale)
-            for place, moved in zip(places, motions, strict=True)
-        ]
+        normals = normals_at(other, places, [end.scale] * len(places), budget.secant_width)
         apart = steps_apart(other, start, weight, list(zip(places, normals, strict=True)))
     prior = prior_weight(problems, end.normal)
     return np.asarray(covariance(problems, end, prior, apart, is_truth))

@@ -238,15 +238,14 @@ def test_a_search_whose_last_steps_still_gain_has_not_arrived(gain, expected):
     """Nor where an earlier stage, of fewer frames, would have been content."""
     problems = (problem(1.0),)
     size = theta_length(problems)
-    rows = []
-    for i in range(8):
-        loss = (1 - gain) ** i
-        end = end_at(np.full(size, 0.5 + 0.01 * i), loss, gradient=1.0, matrix=np.eye(size))
-        rows.append([dataclasses.replace(end, age=jnp.asarray(i))])
+    rows = [
+        [end_at(np.full(size, 0.5 + 0.01 * i), (1 - gain) ** i, gradient=1.0, matrix=np.eye(size))]
+        for i in range(6)
+    ]
     assert has_arrived(Search(problems, rows, 0.0)) == expected
 
 
-@pytest.mark.parametrize(("slope", "damping", "expected"), [(0, 40, 0), (1, 40, 1), (1, 1e-3, 0)])
+@pytest.mark.parametrize(("slope", "damping", "expected"), [(0, 40, 0), (1, 40, 1), (1, 0.1, 0)])
 def test_a_descent_is_stuck_where_no_step_lowers_the_loss_and_the_end_is_far(
     slope, damping, expected
 ):
