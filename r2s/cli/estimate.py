@@ -257,15 +257,13 @@ class EstimateCard:
     def _budget(self, method: "Method") -> "Budget":
         """The method's budget with the numbers asked for; `ValueError` for one that it lacks."""
         asked = {name: getattr(self, name) for name in SEARCH if getattr(self, name) is not None}
-        for name in asked:
+        for name, number in asked.items():
+            option, least = f"--{name}".replace("_", "-"), 0 if name == "num_samples" else 1
             if name not in method.budget_fields:
-                takes = ", ".join(f"--{each}" for each in method.budget_fields)
-                words = f"--{name} is not of {method.name}: it takes {takes}"
-                raise ValueError(words.replace("_", "-"))
-            least = 0 if name == "num_samples" else 1
-            if asked[name] < least:
-                words = f"--{name} must be at least {least}, got {asked[name]}"
-                raise ValueError(words.replace("_", "-"))
+                takes = ", ".join(f"--{each}" for each in method.budget_fields).replace("_", "-")
+                raise ValueError(f"{option} is not of {method.name}: it takes {takes}")
+            if number < least:
+                raise ValueError(f"{option} must be at least {least}, got {number}")
         return method.budget._replace(**asked)
 
 
