@@ -204,15 +204,15 @@ class Export:
 
     def _consequences(self, loss: "Loss") -> "Iterator[str]":
         """What errors of the energy do to a motion, and what helps; nothing of small ones."""
-        if max(map(abs, loss.membrane.values())) > SMALL:
-            farther = {name: 1 / max(1 + error, TINY) for name, error in loss.membrane.items()}
+        if max(map(abs, loss.membrane.values()), default=0.0) > SMALL:
+            farther = {name: 1 / max(1 + e, TINY) for name, e in loss.membrane.items()}
             advice = "a motion under its own weight hardly shows it"
             if self.isotropic:
                 advice += "; without --isotropic it is nearer"
             yield f"the same force stretches it {_range(farther)} times as far: {advice}"
         if max(map(abs, loss.bending.values()), default=0.0) > SMALL:
             # a bending length grows as the cube root (Peirce 1930)
-            wider = {name: (1 + error) ** (1 / 3) for name, error in loss.bending.items()}
+            wider = {name: max(1 + e, TINY) ** (1 / 3) for name, e in loss.bending.items()}
             yield (
                 f"folds are {_range(wider)} times as wide: the mesh's diagonals bend too stiffly; "
                 "a mesh with alternating ones is nearer (docs/guide/export.md)"

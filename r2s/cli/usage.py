@@ -62,7 +62,9 @@ def _sentence(path: str, error: str) -> str:
     title, said, *rest = re.split(r"(?m)^ *-{3,} *$", error + "\n----")
     words = " ".join(said.split())
     if wrong := re.match(r"Error parsing ([\w-]+):.*?('.*?')", words):
-        usual = rest[0].split("\n")[2].strip().removeprefix(f"{wrong[1]} ")
+        lines = (line.strip() for part in rest for line in part.splitlines())
+        usual = next((line for line in lines if line.startswith(f"{wrong[1]} ")), "a value")
+        usual = usual.removeprefix(f"{wrong[1]} ")
         expected = re.sub(r"\{None\}\||[{}]", "", usual)
         return f"{wrong[1]} expects {KINDS.get(expected, expected)}, got {wrong[2]}"
     if words.startswith("Missing from"):  # what an argument is for is indented more

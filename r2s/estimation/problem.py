@@ -6,30 +6,28 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from r2s._util.checks import check_kinds
+from r2s.estimation.hanging_start import start_as_seen
 from r2s.estimation.method import DataRequirements, frames_that_count
-from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.surface import nearest
-from r2s.metrics.losses import TOUCHING, length, robust_weight, surface_residuals
 from r2s.recordings.recording import (
     MeasurementUncertainty,
     Recording,
+    at_rest,
     check_covered,
-    first_motion,
     gripper_positions,
     subsample,
 )
 from r2s.recordings.views import Views, taken_by
 from r2s.scenarios.resolution import mpm_cloth
-from r2s.scenarios.scenario import Scenario, finely_saved, from_recording, rollout
+from r2s.scenarios.scenario import Scenario, finely_saved, from_recording
 
 POINTS = 300  # at most, of a cloud
 TARGETS = 1200  # at most, of a cloud that the sheet must lie near
@@ -40,8 +38,6 @@ CLOCK = 4.0  # standard deviations, by which a clock may be early
 # the mask of each kind of observation
 MASKS = {"clouds": "mask", "markers": "seen", "force": "seen", "expected": "mask"}
 FORCE_SCALE = 0.02  # [m/N]: a load cell is good to 10 mN where a marker is to 0.2 mm
-ROUNDS = 60  # of the registration of a hanging sheet
-SMOOTH, STRETCHED = 0.02, 0.1  # weights of neighbours moving apart, and of edges growing longer
 
 
 class NuisancePrior(NamedTuple):
@@ -209,8 +205,7 @@ class Problem(eqx.Module):
             expected = _expected(recording, scenario, frames, seed)
             thinned = subsample(recording, num_points, None, seed)
             clouds = Clouds(thinned.points[frames], thinned.mask[frames])
-            knots, path = (np.asarray(a) for a in (recording.gripper_times, recording.gripper_path))
-            begins = first == 0 and float(recording.times[0]) <= first_motion(knots, path).shown
+            begins = first == 0 and at_rest(recording)[0]
             if as_seen and scenario.brake is not None and begins:
                 middle = space(jnp.full(space.dim, 0.5, float))
                 scenario = start_as_seen(scenario, middle, clouds.points[0], clouds.mask[0])
@@ -354,10 +349,10 @@ def _expected(
     targets, mask = dense.points[frames], dense.mask[frames]
     clouds = [cloud[kept] for cloud, kept in zip(*map(np.asarray, (targets, mask)), strict=True)]
     apart = jnp.asarray([_apart(cloud) for cloud in clouds], float)
-    taken = np.zeros((len(recording.times), len(views.cameras)), bool)
-    for frame, row in enumerate(taken):
-        row[taken_by(views, frame)] = True
-    views, taken = dataclasses.replace(views, taken=()), jnp.asarray(taken[frames])
+    cameras = np.arange(len(views.cameras))
+    by = (taken_by(views, frame) for frame in range(frames.start, frames.stop))
+    taken = jnp.asarray([np.isin(cameras, each) for each in by])
+    views = dataclasses.replace(views, taken=())
     return ImageObservation(views, taken, mesh.faces[face], weights, grippers, targets, mask, apart)
 
 
@@ -427,77 +422,3 @@ def force_at(recording: Recording, frames: slice | list[int]) -> Force | None:
     directions = np.array([info.sheet.warp]) if scalar else np.eye(3)
     seen = jnp.ones(len(values), bool)
     return Force(jnp.asarray(values, float), seen, jnp.asarray(directions, float))
-
-
-_rollout = eqx.filter_jit(rollout)
-
-
-def start_as_seen(
-    scenario: Scenario,
-    fabric: Fabric,
-    points: Float[Array, "point 3"],
-    mask: Bool[Array, " point"],
-) -> Scenario:
-    """A scenario of a hanging sheet that starts in the shape of its first cloud (`points` [m]).
-
-    A sheet whose corners are nearer to each other than they were cut buckles in one of several
-    shapes, each at rest. Which one a simulation ends in depends on the fabric, and no descent
-    crosses such a jump; near the observed shape, more fabrics come to rest in it (not all: for a
-    stiff denim it fails on some recordings). `fabric`: any of those to be estimated, for the parts
-    that the cloud does not show.
-    """
-    scene = scenario.scene
-    alone = dataclasses.replace(scenario, num_frames=1, frame_times=None)
-    first = _rollout(alone, fabric).x[0]
-    start = registered(points, mask, first, scene.mesh, scene.is_free)
-    path = scenario.path.at[0].set(scenario.path[1])
-    return dataclasses.replace(scenario, start=start, path=path)
-
-
-@eqx.filter_jit
-def registered(
-    points: Float[Array, "point 3"],
-    mask: Bool[Array, " point"],
-    x: Float[Array, "vertex 3"],
-    mesh: Mesh,
-    free: Bool[Array, " vertex"],
-) -> Float[Array, "vertex 3"]:
-    """The vertices `x` [m] of a sheet laid smoothly onto points [m], with edges as long as they
-    were; only `free` vertices move.
-
-    Nonrigid iterative closest points (Amberg, Romdhani and Vetter 2007), with distances to the
-    surface, and outliers down-weighted.
-    """
-    edges = _edges(mesh, len(x))
-    lengths = length(edges @ x)
-    smooth = jnp.kron(SMOOTH * edges.T @ edges, jnp.eye(3, dtype=x.dtype))
-    moving = jnp.repeat(free, 3)
-    share = len(x) / jnp.maximum(jnp.sum(mask, dtype=x.dtype), 1)
-
-    def closer(x: Array, _: None) -> tuple[Array, None]:
-        distance, direction, vertices, weights = surface_residuals(points, mask, x, mesh.faces)
-        shares = jnp.einsum("pk,pkv->pv", weights, jax.nn.one_hot(vertices, len(x), dtype=x.dtype))
-        weight = share * jnp.where(mask, robust_weight(distance), 0)
-        seen = _along(shares, direction)
-        now = length(edges @ x)
-        stretch = _along(edges, edges @ x / jnp.maximum(now, TOUCHING)[:, None])
-        matrix = seen.T @ (weight[:, None] * seen) + smooth + STRETCHED * stretch.T @ stretch
-        force = seen.T @ (weight * distance) - STRETCHED * stretch.T @ (now - lengths)
-        matrix = jnp.where(moving[:, None] & moving[None], matrix, jnp.eye(len(matrix)))
-        change = jnp.linalg.solve(matrix, jnp.where(moving, force, 0))
-        return x + change.reshape(x.shape), None
-
-    return jax.lax.scan(closer, x, length=ROUNDS)[0]
-
-
-def _edges(mesh: Mesh, count: int) -> Float[Array, "edge vertex"]:
-    """The matrix from vertices to the edges of the faces; inner edges count twice."""
-    corner = jax.nn.one_hot(mesh.faces, count, dtype=float)
-    return (corner - jnp.roll(corner, 1, axis=1)).reshape(-1, count)
-
-
-def _along(
-    shares: Float[Array, "row vertex"], direction: Float[Array, "row 3"]
-) -> Float[Array, "row coordinate"]:
-    """The derivative of shares of vertices along directions."""
-    return jnp.einsum("rv,ri->rvi", shares, direction).reshape(len(shares), -1)

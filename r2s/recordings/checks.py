@@ -12,10 +12,10 @@ from r2s.recordings.recording import (
     CORNERS,
     Recording,
     SheetPlacement,
+    at_rest,
     cloud,
     clouds_are_markers,
     corner,
-    first_motion,
     gripper_positions,
 )
 from r2s.recordings.strays import BEYOND, reach, share, strays, without_strays
@@ -168,9 +168,7 @@ def check(recording: Recording) -> list[Finding]:
     thinned = [voxel_means(cloud(recording, f), VOXEL) for f in range(len(recording.times))]
     sparse = clouds_are_markers(recording)
     clouds = thinned if sparse else [_pieces(points) for points in thinned]
-    path, knots = np.asarray(recording.gripper_path), np.asarray(recording.gripper_times)
-    shown = first_motion(knots, path).shown
-    still = np.flatnonzero(np.asarray(recording.times) <= shown).tolist() or [0]
+    still = np.flatnonzero(at_rest(recording)).tolist() or [0]
     frames = _Frames(recording, thinned, clouds, gripper_positions(recording), still)
     findings = [*_check_sheet(frames), *_check_clock(frames)]
     if not sparse:

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Num, UInt8
 
+from r2s._util.checks import SHOWN
 from r2s._util.extras import require
-from r2s._util.files import SHOWN, write_bytes
+from r2s._util.files import write_bytes
 from r2s.recordings.clocks import find_frames
 from r2s.recordings.clouds import read_values
 

@@ -28,11 +28,11 @@ from r2s.recordings.recording import (
 from r2s.recordings.rgbd import (
     Images,
     Rig,
-    between,
     find_images,
     find_rig,
     read_clouds,
     read_rig,
+    used_times,
     with_cameras,
 )
 from r2s.recordings.segmentation import FrameCuts, Segmentation, Segmenter, read_colours
@@ -339,7 +339,7 @@ def read_recording(
     cuts, segmenter = [] if cuts is None else cuts, None
     if (how := found.segmentation) is not None:
         known = how, scenario.sheet, scenario.table_height, held, clock, str(place), in_world
-        segmenter = Segmenter(*known, between(times, used), cuts)
+        segmenter = Segmenter(*known, used_times(times, used), cuts)
     info = RecordingInfo(
         name=name,
         scenario=found.scenario_name,

@@ -27,7 +27,7 @@ PATH = ("knot", "gripper", 3)
 STILL = 2e-3  # [m]: a gripper that goes farther than this moves; at rest robots jitter by less
 JITTER, FEWEST = 4.0, 10  # standard deviations of it, within which knots are at rest; of so many
 EXACT = 1e-6  # [m], the same of a path without jitter
-STEP = 0.025  # [s], the longest of a simulation
+MAX_STEP = 0.025  # [s]: 1 mm from the limit of small steps in a lift of 2.5 s, by measurement
 CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rate
 
 
@@ -298,6 +298,12 @@ def first_motion(
     return FirstMotion(float(knots[rest[-1]]), float(shown))
 
 
+def at_rest(recording: Recording) -> Bool[np.ndarray, " frame"]:
+    """Which frames show the sheet before the grippers' first motion."""
+    knots, path = np.asarray(recording.gripper_times), np.asarray(recording.gripper_path)
+    return np.asarray(recording.times) <= first_motion(knots, path).shown
+
+
 def interpolated(
     times: Float[np.ndarray, " time"],
     knots: Float[np.ndarray, " knot"],
@@ -309,7 +315,7 @@ def interpolated(
     return between.reshape(-1, *values.shape[1:])
 
 
-def lasts(times: Float[np.ndarray, " frame"]) -> Float[np.ndarray, " frame"]:
+def frame_durations(times: Float[np.ndarray, " frame"]) -> Float[np.ndarray, " frame"]:
     """How long [s] each frame lasts when they are played: until the next, the last as most do."""
     gaps = np.diff(times)
     return np.append(gaps, np.median(gaps) if len(gaps) else 1.0)
@@ -434,7 +440,7 @@ def _check_times(what: str, times: Any, count: int) -> np.ndarray:
 
 
 def _check_end(knots: np.ndarray, times: np.ndarray) -> None:
-    if knots[-1] < times[-1] - STEP:  # within a step the grippers stay where they are
+    if knots[-1] < times[-1] - MAX_STEP:  # within a step the grippers stay where they are
         raise ValueError(
             f"the gripper path ends at {knots[-1]:g} s, before the last frame at {times[-1]:g} s: "
             "log it longer, leave the last frames out, or correct the time offset"

@@ -199,7 +199,7 @@ def rgbd_recording(
     found = find_images(folder, rig, coloured=how is not None and how.colour is not None)
     if how is not None:
         what = how, info.sheet, info.table_height, path, knots, str(folder)
-        segmenter = Segmenter(*what, used=between(found.times, info.frames_used))
+        segmenter = Segmenter(*what, used=used_times(found.times, info.frames_used))
     alone: list[dict[str, np.ndarray]] = []
     times, clouds = read_clouds(folder, rig, found, segmenter=segmenter, alone=alone)
     still = (times <= first_motion(knots, path).shown).tolist()
@@ -208,7 +208,7 @@ def rgbd_recording(
     return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
 
 
-def between(times: Float[np.ndarray, " frame"], used: tuple[int, int]) -> tuple[float, float]:
+def used_times(times: Float[np.ndarray, " frame"], used: tuple[int, int]) -> tuple[float, float]:
     """The times [s] of the first and the last frame that count."""
     first, last = np.clip(used, 0, len(times) - 1)
     return float(times[first]), float(times[last])
@@ -366,10 +366,10 @@ def _same_frames(folder: Path, kind: str, depths: Frames, suffixes: Collection[s
     others, tolerance = find_frames(folder / kind, suffixes), 0.0
     if depths.stamps is not None:
         tolerance = min(ROUNDED, float(np.diff(depths.stamps).min(initial=1.0)) / 10)
-    apart = np.abs(np.subtract.outer(depths.keys, others.keys))
-    nearest = apart.argmin(axis=1)
-    lacking = [depths.files[i] for i in np.flatnonzero(apart.min(axis=1) > tolerance)]
-    left = [path for i, path in enumerate(others.files) if i not in set(nearest.tolist())]
+    own, other = (np.array(frames.keys, float)[:, None] for frames in (depths, others))
+    apart, nearest = KDTree(other).query(own)
+    lacking = [depths.files[i] for i in np.flatnonzero(apart > tolerance)]
+    left = [others.files[i] for i in np.setdiff1d(np.arange(len(other)), nearest)]
     for where, path in [*((kind, path) for path in lacking), *(("depth", path) for path in left)]:
         raise ValueError(
             f"{folder / where}: no image that belongs to {path}: export it again, or drop the "

@@ -19,7 +19,13 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import TurnedMembrane
 from r2s.mesh.mesh import Mesh, corner, rectangle
 from r2s.mesh.mesh import resized as resized_mesh
-from r2s.recordings.recording import Recording, SheetPlacement, first_motion, interpolated
+from r2s.recordings.recording import (
+    MAX_STEP,
+    Recording,
+    SheetPlacement,
+    first_motion,
+    interpolated,
+)
 from r2s.scenarios.paths import Route, ease
 from r2s.scenarios.sheet_solver import Braked, SheetSolver
 from r2s.solvers.implicit.cloth import MAX_ITERATIONS, ImplicitCloth, prepare_mesh
@@ -29,7 +35,6 @@ CLEARANCE = 1e-3  # [m], between the table and a sheet that lies on it
 LEAD_IN = 0.5  # [s], in which the grippers go from the sheet at rest to where their path begins
 GRID = 0.0125  # [s], at least a step: between the states that frames at uneven times lie between
 EVEN = 1e-3  # of the interval, by which frames may deviate from even times
-MAX_STEP = 0.025  # [s]: 1 mm from the limit of small steps in a lift of 2.5 s, by measurement
 SETTLING = 3.0  # [s], in which a sheet that hangs comes to rest before the first frame
 BRAKE = 8.0  # [1/s], mass damping meanwhile: of a sheet of 0.45 m 4e-11 of the energy remain
 ITERATIONS = 1000  # of Newton's method, of a hanging sheet: 33 x 33 vertices may need over 500

@@ -20,7 +20,7 @@ from r2s.estimation.problem import Clouds
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 from r2s.metrics.losses import masked_mean, surface_residuals
-from r2s.recordings.recording import Recording, lasts, subsample
+from r2s.recordings.recording import Recording, frame_durations, subsample
 from r2s.scenarios import Experiment
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
 from r2s.solvers.simulate import Solution
@@ -187,7 +187,7 @@ class Page:
 
     def _run(self) -> None:
         # how long each frame is shown: until the next, the last as long as most of them
-        lasting = lasts(np.asarray(self.moved.motion.times, np.float64))
+        lasting = frame_durations(np.asarray(self.moved.motion.times, np.float64))
         due = time.monotonic()
         while not self._stop.is_set():
             if self._changed.is_set():

@@ -19,7 +19,7 @@ from jaxtyping import Float, UInt8
 from r2s._util.extras import require
 from r2s._util.files import write_bytes
 from r2s.recordings.open import SimulatedCloth
-from r2s.recordings.recording import Recording, SheetPlacement, cloud, corner, lasts
+from r2s.recordings.recording import Recording, SheetPlacement, cloud, corner, frame_durations
 from r2s.viewer.cuts import write_figure
 
 # The object API alone: pyplot would keep every figure, and choose a backend for the caller.
@@ -67,9 +67,9 @@ def show(
     if video == "auto":
         video = "gif" if importlib.util.find_spec("cv2") is None else "mp4"
     if video != "none":
-        path, lasting = folder / f"{stem}.{video}", lasts(np.asarray(recording.times, np.float64))
+        path, times = folder / f"{stem}.{video}", np.asarray(recording.times, np.float64)
         write = write_mp4 if video == "mp4" else write_gif
-        write(path, pictures(recording, cloth), lasting)
+        write(path, pictures(recording, cloth), frame_durations(times))
         written.append(path)
     return written
 

@@ -81,6 +81,19 @@ def test_physnet_needs_a_file_for_its_network(recording):
         METHODS["physnet"]().estimate([recording], SPACE, key=jr.key(0))
 
 
+def test_a_recipe_with_parameters_of_its_own_has_no_prior_of_the_space(recording, monkeypatch):
+    """Such as the two multipliers of DIFFCLOUD's published recipe, in a space of others."""
+    ranges = tuple(
+        dataclasses.replace(bound, name=f"own {bound.name}") for bound in SPACE.ranges[:1]
+    )
+    place, nothing = jnp.full(SPACE.dim, 0.5), np.zeros((1, 1, SPACE.dim))
+    space = point_estimate("test", SPACE, place, 0.0, np.zeros((1, 1)), nothing, 0.0)
+    for estimate, count in ((space, SPACE.dim), (dataclasses.replace(space, ranges=ranges), 0)):
+        kind = METHODS["diffcloud-published"]
+        monkeypatch.setattr(kind, "_estimate", lambda *_, found=estimate: found)
+        assert len(kind().estimate([recording], SPACE, key=jr.key(0)).prior_errors) == count
+
+
 def ran(name: str, recording, space, solver=None, **others):
     """An estimate of a tiny budget."""
     method = METHODS[name](solver=solver, shape=(4, 4), **others)

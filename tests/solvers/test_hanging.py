@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation.problem import registered, start_as_seen
+from r2s.estimation.hanging_start import registered, start_as_seen
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.mesh import borders, rectangle

@@ -11,7 +11,8 @@ from conftest import DT, cloth, flat
 
 from r2s.environment.scene import Control
 from r2s.mesh.mesh import rectangle
-from r2s.scenarios.scenario import MAX_STEP, steps_between
+from r2s.recordings.recording import MAX_STEP
+from r2s.scenarios.scenario import steps_between
 from r2s.solvers.results import Result, describe, first_failure
 from r2s.solvers.simulate import predicted_memory, simulate
 

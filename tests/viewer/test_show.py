@@ -16,7 +16,7 @@ from r2s.recordings.open import (
     open_recording,
     save_trajectory,
 )
-from r2s.recordings.recording import lasts, save
+from r2s.recordings.recording import frame_durations, save
 from r2s.viewer.pictures import _draw_force, contact_sheet, pictures, show, write_gif, write_mp4
 
 
@@ -30,11 +30,11 @@ def test_a_sheet_and_a_gif_are_written(tmp_path: Path) -> None:
     assert [path.name for path in written] == ["lift_made.png", "lift_made.gif"]
     assert sorted(written) == sorted((tmp_path / "new" / "folder").iterdir())
     with Image.open(written[1]) as video:
-        lasts = []
+        frame_durations = []
         for frame in range(getattr(video, "n_frames", 1)):
             video.seek(frame)
-            lasts.append(video.info["duration"])
-    assert lasts == [70, 60, 70, 70, 60]  # [ms]: 5/15 s in all
+            frame_durations.append(video.info["duration"])
+    assert frame_durations == [70, 60, 70, 70, 60]  # [ms]: 5/15 s in all
     assert (0xD5, 0x5E, 0x00) in colours(written[0])  # the cloud
 
 
@@ -91,7 +91,7 @@ def test_videos_go_by_the_frames_times(tmp_path: Path) -> None:
     cv2 = pytest.importorskip("cv2")
     grey = np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, axis=2)
     frames = [np.roll(grey, 5 * n, axis=0) for n in range(3)]
-    lasting = lasts(np.array([0.0, 0.1, 0.3]))
+    lasting = frame_durations(np.array([0.0, 0.1, 0.3]))
     np.testing.assert_allclose(lasting, [0.1, 0.2, 0.15])
     write_gif(tmp_path / "v.gif", frames, lasting)
     with Image.open(tmp_path / "v.gif") as video:
