@@ -125,11 +125,11 @@ def test_the_doctor_knows_the_installation(capsys: pytest.CaptureFixture) -> Non
 def test_the_doctor_finds_wrong_units(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for make in presets.MEASURED.values():
         assert not list(implausible(make()))
-    wrong = dataclasses.replace(presets.black_denim(), density=jnp.asarray(320.0))
-    cards.write(tmp_path / "grams.json", Card.make("grams", wrong, Provenance("weighed in g")))
-    assert main(["doctor", "--fabric", str(tmp_path / "grams.json")]) == 1
+    wrong = dataclasses.replace(presets.black_denim(), density=jnp.asarray(3.2))
+    cards.write(tmp_path / "ounces.json", Card.make("ounces", wrong, Provenance("weighed")))
+    assert main(["doctor", "--fabric", str(tmp_path / "ounces.json")]) == 1
     text = capsys.readouterr().out
-    assert "WRONG: grams: density is 320 kg/m^2, expected 0.05 to 1 (an areal density" in text
+    assert "WRONG: ounces: density is 3.2 kg/m^2, expected 0.05 to 1 (an areal density" in text
 
 
 def test_the_doctor_looks_at_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
