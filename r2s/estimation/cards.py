@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from r2s._util.checks import expect_value as expect
+from r2s._util.checks import shown
 from r2s._util.files import load_json, write_json
 from r2s.estimation import estimate as estimates
 from r2s.estimation.estimate import Estimate
@@ -178,7 +179,8 @@ def from_json(stored: Any) -> Card:
     form = stored.get("format") if isinstance(stored, dict) else type(stored).__name__
     if form not in (FORMAT, FORMAT_0_2):
         raise ValueError(
-            f"no fabric card: format must be {FORMAT!r}, found {form!r}; r2s estimate writes one"
+            f"no fabric card: format must be {FORMAT!r}, found {shown(form)}: "
+            "r2s estimate writes one"
         )
     check_keys(stored, KEYS, "")
     for name in ("name", "precision"):

@@ -13,7 +13,7 @@ import numpy as np
 
 from r2s._util.files import parse, read_json, write_json
 from r2s.materials.bending import HingeBending
-from r2s.materials.fabric import Fabric, check_fabric
+from r2s.materials.fabric import Fabric, check_density, check_fabric
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import OrthotropicPlate, PlateBending
 from r2s.materials.tables import HINGE_FACTOR, TableBending, TableMembrane
@@ -38,6 +38,7 @@ class Material:
     def __post_init__(self):
         if not self.density > 0:
             raise ValueError(f"density must be above 0 kg/m^2, got {self.density}")
+        check_density(self.density)
         # measured C12 and C33 may be negative
         for row, (c11, _, c22, _) in enumerate(self.stretching):
             if not min(c11, c22) > 0:

@@ -1,9 +1,7 @@
-"""The commands that README and docs show are understood, and those of the quickstart run."""
+"""The commands that README and docs show are understood; `test_packaging` runs the quickstart."""
 
 import re
 import shlex
-import subprocess
-import sys
 
 import pytest
 from folders import ROOT
@@ -34,17 +32,3 @@ def test_a_command_of_the_documents_is_understood(arguments, monkeypatch):
     else:
         assert main(arguments) == 0
         assert len(ran) == 1
-
-
-@pytest.mark.slow(group="documents")
-def test_the_commands_of_the_quickstart_run_one_after_the_other(tmp_path):
-    """From a simulated recording to a model of another simulator, as a reader would type them."""
-    typed = commands((ROOT / "docs" / "quickstart.md").read_text("utf-8"))
-    assert [each[0] for each in typed] == ["simulate", "check", "estimate", "evaluate", "export"]
-    for arguments in typed:
-        done = subprocess.run(
-            [sys.executable, "-m", "r2s", *arguments], capture_output=True, text=True, cwd=tmp_path
-        )
-        assert done.returncode == 0, f"r2s {' '.join(arguments)}: {done.stderr[-2000:]}"
-    files = {path.name for path in tmp_path.iterdir()}
-    assert files >= {"motion.npz", "lift.npz", "denim.json", "sheet.xml"}

@@ -23,6 +23,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt
 
+from r2s._util.checks import shown
 from r2s._util.files import parse
 from r2s.estimation import checkpoint
 from r2s.estimation.physnet.dataset import DEPTH_UNIT, Data
@@ -367,7 +368,7 @@ def load(path: Path | str) -> Training:
     """
     arrays, stored = checkpoint.read(path)
     if stored.get("format") != FORMAT:
-        raise ValueError(f"{path}: expected format {FORMAT}, found {stored.get('format')}")
+        raise ValueError(f"{path}: expected format {FORMAT}, found {shown(stored.get('format'))}")
     header = parse(_Header, stored, f"{path}")
     empty = begin(header.view, header.architecture, header.schedule)
     network, optimiser = checkpoint.tree_from(arrays, _state(empty))
