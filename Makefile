@@ -21,9 +21,8 @@ GROUP :=
 # one thread each: threads that wait for each other cost more than they compute, those of OpenBLAS
 # twice as much as all the rest. A program that is read from a file makes XLA complain of features
 # of the machine that it made up: it is silenced.
-ALONE := OMP_NUM_THREADS=1 TF_CPP_MIN_LOG_LEVEL=3
-QUICK := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 \
-	--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1
+ALONE := OMP_NUM_THREADS=1 NPROC=1 TF_CPP_MIN_LOG_LEVEL=3
+QUICK := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
 
 # Documented by `make docs`: the public surface, `import r2s`, then the rooms below it.
 MODULES := r2s $(filter-out r2s.__init__,$(subst /,.,$(basename \

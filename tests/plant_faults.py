@@ -17,10 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
-QUICK = (
-    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 "
-    "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-)
+QUICK = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
 
 
 class Fault(NamedTuple):
@@ -252,7 +249,7 @@ def plant(package: Path, fault: Fault) -> Path:
 def is_caught(copy: Path, fault: Fault) -> bool:
     """Whether one of the fault's tests fails."""
     tests = [str(copy / "tests" / name) for name in fault.tests.split()]
-    quiet = {"OMP_NUM_THREADS": "1", "TF_CPP_MIN_LOG_LEVEL": "3", "XLA_FLAGS": QUICK}
+    quiet = {"OMP_NUM_THREADS": "1", "NPROC": "1", "TF_CPP_MIN_LOG_LEVEL": "3", "XLA_FLAGS": QUICK}
     command = [sys.executable, "-m", "pytest", "-q", "-x", *tests]
     done = subprocess.run(command, cwd=copy, env=os.environ | quiet, capture_output=True, text=True)
     if done.returncode not in (0, 1):  # no tests, or an error of pytest itself

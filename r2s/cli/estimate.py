@@ -107,6 +107,7 @@ class EstimateCard:
 
     def run(self) -> int:
         from r2s._util.files import check_folders
+        from r2s._util.threads import one_at_a_time
         from r2s.cli.common import check_picture, print_result
         from r2s.cli.estimate_report import explains_nothing, make_card, report
         from r2s.cli.waiting import Waiting
@@ -115,6 +116,8 @@ class EstimateCard:
 
         check_folders(self.out)
         check_picture(self.plot)
+        if len(self.recordings) == 1 and self.method == "diffcloud":
+            one_at_a_time()
         with Waiting("reading the recordings") as progress:
             outcome = self._estimate(progress)
         if (reason := explains_nothing(outcome)) and not self.force:

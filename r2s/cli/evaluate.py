@@ -42,11 +42,13 @@ class Evaluate:
     json: Json = False
 
     def run(self) -> int:
+        from r2s._util.threads import one_at_a_time
         from r2s.cli.common import check_picture, load_card, print_result
         from r2s.metrics.prediction_error import UNITS
         from r2s.recordings.open import open_recordings
 
         check_picture(self.plot)
+        one_at_a_time()
         card, lines = load_card(self.fabric), []
         judged: dict[str, Judged] = {}
         recordings = list(open_recordings(self.recordings))

@@ -30,7 +30,7 @@ from r2s.cli.recordings import Check, Data, Show
 from r2s.cli.study import Study
 from r2s.cli.view import View
 from r2s.estimation.cards import version
-from r2s.study.engine import one_thread
+from r2s.study.engine import compile_fast
 
 NO_CACHE = "--no-cache"
 COMMANDS = {
@@ -134,7 +134,7 @@ def _choice(is_list: bool) -> Any:
 def command() -> int:
     """`main` in a process of its own, which keeps what it compiles."""
     gc.set_threshold(100_000, 50, 100)  # to trace makes many objects that stay
-    os.environ["XLA_FLAGS"] = one_thread(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
+    os.environ["XLA_FLAGS"] = compile_fast(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
     if NO_CACHE in sys.argv:
         compilation.forget()
     else:

@@ -48,6 +48,7 @@ class Simulate:
 
         from r2s import scenarios
         from r2s._util.files import check_folders
+        from r2s._util.threads import one_at_a_time
         from r2s.cli.common import choose_shape, load_card, make_experiment, print_result
         from r2s.cli.waiting import Waiting
         from r2s.recordings.open import save_trajectory
@@ -61,6 +62,8 @@ class Simulate:
                 "--self-contact is of the implicit cloth: explicit steps have none, and material "
                 "points touch through their grid"
             )
+        if self.solver != "mpm":
+            one_at_a_time()
         card, experiment = load_card(self.fabric), make_experiment(self.scenario, self.motion)
         fabric, size = card.fabric, experiment.sheet.size
         shape, of_shape, of_mesh = choose_shape(self.shape, fabric, size, self.scenario)

@@ -6,7 +6,6 @@ fails does not stop the others, and a run that was killed continues where it was
 """
 
 import os
-import re
 import shutil
 import sys
 import threading
@@ -22,10 +21,9 @@ from typing import Any
 
 from r2s import compilation
 from r2s._util.extras import require
-from r2s._util.threads import LIMIT
+from r2s._util.threads import LIMIT, POOL
 from r2s.study.tasks import Task, attempt, dependencies, with_dependencies
 
-ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 # Compiles a step in 60 to 70 % of the time. XLA ends a process whose flags it does not know, so
 # only releases that know it are given it.
 COMPILE_FAST, KNOWN_TO = "--xla_cpu_use_fusion_emitters=false", "0.10."
@@ -169,16 +167,10 @@ def _say(words: str) -> None:
     print(words, file=sys.stderr, flush=True)
 
 
-def one_thread(flags: str) -> str:
-    """XLA's flags with linear algebra in one thread, as sheets are too small for more.
-
-    XLA reads no further than the last word, so existing flags come first.
-    """
-    if ONE_THREAD in flags:
-        return flags
+def compile_fast(flags: str) -> str:
+    """XLA's flags with `COMPILE_FAST`, where the release knows it and they do not say otherwise."""
     is_known = version("jaxlib").startswith(KNOWN_TO) and "fusion_emitters" not in flags
-    parts = [flags, COMPILE_FAST if is_known else "", ONE_THREAD]
-    return " ".join(part for part in parts if part)
+    return f"{COMPILE_FAST} {flags}".strip() if is_known else flags
 
 
 def environment(workers: int, compilation_cache: Path | None = None) -> dict[str, str]:
@@ -188,10 +180,9 @@ def environment(workers: int, compilation_cache: Path | None = None) -> dict[str
     memory. Compiled programs are by default where `r2s.compilation.keep` has them.
     """
     level = os.environ.get("TF_CPP_MIN_LOG_LEVEL", JAX_LEVEL)
-    variables = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    variables |= {
-        LIMIT: "1",
-        "XLA_FLAGS": one_thread(os.environ.get("XLA_FLAGS", "")),
+    ones = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", LIMIT, POOL)
+    variables = dict.fromkeys(ones, "1") | {
+        "XLA_FLAGS": compile_fast(os.environ.get("XLA_FLAGS", "")),
         "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / workers:.3f}",
         "EQX_ON_ERROR": "nan",
         "TF_CPP_MIN_LOG_LEVEL": "3" if level == JAX_LEVEL else level,  # see `r2s.__main__`
@@ -199,15 +190,6 @@ def environment(workers: int, compilation_cache: Path | None = None) -> dict[str
     if compilation_cache is not None:
         variables["JAX_COMPILATION_CACHE_DIR"] = str(compilation_cache)
     return variables
-
-
-def begin_worker(number: int | None = None) -> None:
-    """Prepare a process that runs tasks, and on Linux bind it to a core by its number: JAX makes as
-    many threads as it has cores, and those of several processes would wait for each other."""
-    if number is not None and hasattr(os, "sched_setaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cores[number % len(cores)]})
-    compilation.keep()
 
 
 class OneProcess(Runner):
@@ -232,7 +214,7 @@ class OneProcess(Runner):
 
     @staticmethod
     def _start() -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=begin_worker)
+        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=compilation.keep)
 
 
 class DaskWorkers(Runner):
@@ -316,5 +298,5 @@ def _configure(variables: dict[str, str]) -> None:
 
 
 def dask_setup(worker: Any) -> None:
-    """Prepare a worker of Dask that preloads this module; its name ends with a number."""
-    begin_worker(int(re.findall(r"\d+", str(worker.name))[-1]))
+    """Prepare a worker of Dask that preloads this module."""
+    compilation.keep()

@@ -1,6 +1,9 @@
 """Calls on threads give what calls one after the other give."""
 
+import os
 import re
+import subprocess
+import sys
 import threading
 import time
 
@@ -131,3 +134,24 @@ def test_what_runs_side_by_side_factors_no_batch_of_matrices():
     matrices = jnp.broadcast_to(prior, (12, 5, 5))
     assert batches(jax.vmap(jnp.linalg.solve), matrices, scores)
     assert not batches(gauss_newton.scatter, scores, matrices, jnp.ones(12), prior, 1.0)
+
+
+POOL = """
+import os, sys
+from r2s._util.threads import one_at_a_time
+one_at_a_time()
+import jax.numpy as jnp
+jnp.zeros(3).block_until_ready()
+names = [open(f"/proc/self/task/{task}/comm").read() for task in os.listdir("/proc/self/task")]
+print(names.count("tf_XLAEigen\\n"))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="threads are counted in /proc")
+@pytest.mark.parametrize("set_to", [None, "3"])
+def test_xla_has_one_thread_where_no_other_number_is_set(set_to):
+    """The names are of jaxlib 0.10.1."""
+    known = {name: value for name, value in os.environ.items() if name != "NPROC"}
+    own = known | ({} if set_to is None else {"NPROC": set_to})
+    run = subprocess.run([sys.executable, "-c", POOL], capture_output=True, text=True, env=own)
+    assert run.stdout.split() == [set_to or "1"], run.stderr
