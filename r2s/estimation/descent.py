@@ -1,5 +1,6 @@
 """The search for the best fabric: coarse sampling, then Gauss-Newton descents."""
 
+import dataclasses
 import itertools
 import time
 from pathlib import Path
@@ -20,6 +21,7 @@ from r2s.estimation.gauss_newton import (
     losses_at,
     normals_at,
     objective,
+    prior_terms,
     prior_weight,
     propose,
     remaining,
@@ -62,6 +64,7 @@ class Stop(NamedTuple):
 # too early: the outliers of then may hold it there); or, where more frames follow, roughly.
 AT_THE_END, ON_THE_WAY = Stop(5e-3, 4, 5e-4, 10.0), Stop(0.03, 2, 3e-3, 10.0)
 MORE_FRAMES = Stop(0.03, 2, 0.02, 1.0)
+LIKELY = 1.25  # times the least loss, within which another end is part of the errors
 ONE_ERROR = 0.5  # predicted gain over the prior's weight, of a step of one standard error
 Iteration = list[Descent]  # one iteration: the descents of all starts
 DEFAULT = Budget(frame_fractions=(0.25, 0.5))
@@ -77,6 +80,7 @@ class Run(NamedTuple):
     - `derive`: derivatives at a theta, with a cache of the latest.
     - `checkpoint`: a file of the state after every iteration, from which the same search resumes.
     - `progress`: called with the iteration and the best loss [m^2].
+    - `known`: the end of another search. A search that `leads_to` it ends.
     """
 
     budget: Budget
@@ -84,6 +88,7 @@ class Run(NamedTuple):
     derive: Derive
     checkpoint: Path | None = None
     progress: Progress | None = None
+    known: Descent | None = None
 
     def near(self, **changes: Any) -> "Run":
         """For one descent that begins near its end; `changes` of the budget."""
@@ -243,7 +248,10 @@ def _next(problems: Problems, run: Run, rows: list[Iteration]) -> Iteration | No
     stop = _stop(budget, now)
     kept = _kept(row, len(stage))
     moving = [i for i in kept if not _arrived(problems, stage, i, prior, stop)]
-    is_passed = budget.warm_start and now < len(_shares(budget)) - 1
+    is_last = now == len(_shares(budget)) - 1
+    if is_last and run.known is not None and leads_to(problems, best, run.known):
+        return None
+    is_passed = budget.warm_start and not is_last
     if is_passed or not moving or len(stage) > budget.max_iterations:
         return _next_stage(problems, run, row)
     seen = _seen(problems, budget, now)
@@ -314,6 +322,18 @@ def has_arrived(search: Search) -> bool:
     now, prior = int(best.stage), prior_weight(search.problems, best.normal)
     stage = _rows_of_stage(search.rows, now)
     return _arrived(search.problems, stage, which, prior, AT_THE_END)
+
+
+def leads_to(problems: Problems, descent: Descent, known: Descent) -> bool:
+    """Whether a descent fits about as well as a known end, and its next step would end within a
+    standard error of it."""
+    if not float(descent.normal.loss) <= LIKELY * float(known.normal.loss):
+        return False
+    undamped = dataclasses.replace(descent, damping=jnp.zeros_like(descent.damping))
+    off = propose(problems, undamped, prior_weight(problems, descent.normal)) - known.theta
+    prior = prior_weight(problems, known.normal)
+    matrix = known.normal.matrix + prior * prior_terms(problems, known.theta)[1]
+    return bool(off @ matrix @ off / 2 <= ONE_ERROR * prior)
 
 
 def is_stuck(search: Search) -> bool:

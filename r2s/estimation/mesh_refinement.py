@@ -18,7 +18,15 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.descent import Diverged, Run, Search, each_alone, multi_start
+from r2s.estimation.descent import (
+    LIKELY,
+    Diverged,
+    Run,
+    Search,
+    each_alone,
+    leads_to,
+    multi_start,
+)
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import FINEST, MARGIN, Descent, loss_from
 from r2s.estimation.judgement import with_uncertainty
@@ -40,7 +48,6 @@ Shapes = tuple[Shape, ...]  # of the meshes, one for each recording
 # 7.3 mm off one in explicit steps, in these 0.7
 FINEST_STEP = 1 / 180
 ALIKE = 1.02  # times the least loss, within which two ends fit equally well
-LIKELY = 1.25  # times that, within which the distance of two ends is part of the errors
 MOST = 3  # searches, where the first two differ
 
 
@@ -180,7 +187,8 @@ def look_again(search: Search, run: Run, coarse: Problems | None = None) -> Sear
 
     There is a third search where the first two differ. All losses count the same points, by the
     outlier scale of the best fit. Ends that lie apart but fit nearly as well are part of the
-    standard errors (`others`). A search that diverges counts as one that ended elsewhere.
+    standard errors (`others`). A search that leads to the first one's end ends there; one that
+    diverges counts as one that ended elsewhere.
 
     - `coarse`: the same recordings on a coarser mesh, on which the other searches begin; None: they
       begin on the mesh of the first.
@@ -197,7 +205,10 @@ def look_again(search: Search, run: Run, coarse: Problems | None = None) -> Sear
             if coarse is not None:
                 start = multi_start(coarse, own, start=start, words=words).theta
                 own = run.near(is_intermediate=True).beside(f".search{count}.end.npz")
-            ends.append(multi_start(problems, own, start=start, words=words))
+            own = own._replace(known=search.best)
+            end = multi_start(problems, own, start=start, words=words)
+            is_known = leads_to(problems, end.best, search.best)
+            ends.append(end._replace(rows=search.rows) if is_known else end)
         except Diverged:
             tell(run.progress, f"search {count} diverged")
         losses = _losses(ends, run)

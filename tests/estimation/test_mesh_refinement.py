@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from known_ends import PLACE, SMALL, SPACE, end_at, lift_of, problem
+from known_ends import PLACE, SMALL, SPACE, end_at, lift_of, problem, short_problem, valley
 
 from r2s.estimation import mesh_refinement
 from r2s.estimation.checkpoint import forget
-from r2s.estimation.descent import DEFAULT, Diverged, Run, Search, has_arrived, is_stuck
+from r2s.estimation.descent import DEFAULT, Diverged, Run, Search, has_arrived, is_stuck, leads_to
 from r2s.estimation.estimate import as_json, from_json, point_estimate
 from r2s.estimation.gauss_newton import normal_from
 from r2s.estimation.mesh_refinement import ALIKE, LIKELY, look_again
@@ -85,7 +85,7 @@ def test_where_all_diverges_on_a_finer_mesh_the_estimate_is_of_the_coarser_and_s
 
     nothing = point_estimate("none", SPACE, PLACE, 0.0, np.zeros((1, 1)), np.zeros((1, 1, 2)), 0.0)
     monkeypatch.setattr(mesh_refinement, "multi_start", search)
-    monkeypatch.setattr(mesh_refinement, "look_again", lambda search, _: search)
+    monkeypatch.setattr(mesh_refinement, "look_again", lambda search, *_: search)
     monkeypatch.setattr(mesh_refinement, "with_uncertainty", lambda *_, **__: nothing)
     monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
@@ -163,6 +163,7 @@ def by_place(monkeypatch) -> tuple[Run, list[float]]:
         return float(predicted[0][0])
 
     monkeypatch.setattr(mesh_refinement, "loss_from", loss)
+    monkeypatch.setattr(mesh_refinement, "leads_to", lambda *_: False)
     run = Run(DEFAULT, jr.key(0), lambda _, theta, __: [(theta, None)])  # pyright: ignore
     return run, scales
 
@@ -224,6 +225,35 @@ def test_a_killed_look_at_other_starts_resumes(monkeypatch, tmp_path):
     assert len(files) == 5 == len(set(files))  # two searches on two meshes, and the end of the best
     forget(tmp_path / "state.npz")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_search_that_leads_to_the_known_end_ends_there():
+    """Where the loss is quadratic one Gauss-Newton step leads to its minimum."""
+    lifted = short_problem()
+    known, at = valley(lifted, theta_length((lifted,)))
+    known = dataclasses.replace(known, normal=at(known.theta, loss=1.0))
+    place = known.theta.at[:2].add(jnp.array([0.03, -0.02]))
+
+    def near(gradient, loss):
+        return dataclasses.replace(known, theta=place, normal=at(place, gradient, loss))
+
+    assert leads_to((lifted,), near(0.0, 1.2), known)
+    assert not leads_to((lifted,), near(0.0, 1.3), known)  # it fits worse
+    assert not leads_to((lifted,), near(1.0, 1.2), known)  # another minimum
+    assert not leads_to((lifted,), near(0.0, jnp.nan), known)
+    far = dataclasses.replace(near(0.0, 1.2), theta=known.theta.at[0].add(0.4))
+    assert not leads_to((lifted,), far, known)  # a step is shorter than that
+
+
+def test_a_search_that_leads_to_the_first_end_confirms_it(monkeypatch):
+    by_place(monkeypatch)
+    first, halfway = ended(0.3), ended(0.36)
+    monkeypatch.setattr(mesh_refinement, "multi_start", lambda *_, **__: halfway)
+    run = by_place(monkeypatch)[0]
+    monkeypatch.setattr(mesh_refinement, "leads_to", lambda _, end, known: known is first.best)
+    found = look_again(first, run)
+    assert found.reached == (2, 2) and float(found.theta[0]) == pytest.approx(0.3)
+    assert found.seconds == 2.0
 
 
 def test_an_end_that_fits_nearly_as_well_is_in_the_errors_though_it_confirms_nothing(monkeypatch):
