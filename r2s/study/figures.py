@@ -217,15 +217,20 @@ def _figure(motion: Motion, colours: Mapping[str, str], budget: int) -> go.Figur
     start = max(int(motion.inside[frames].sum()) - 1, 0)
     points = {"mode": "markers", "marker": {"size": 1.5, "color": RED}, "name": "recorded points"}
     looks = [points, *(_look(motion, label, colours[label]) for label in motion.vertices)]
-    names = [f"{motion.times[i]:.2f} s" for i in frames]
+    names = [f"{motion.times[i]:.3f} s" for i in frames]
     figure = go.Figure(
         [look | own for look, own in zip(looks, data[start], strict=True)],
         frames=[go.Frame(name=name, data=own) for name, own in zip(names, data, strict=True)],
     )
     steps = [{"method": "animate", "label": name, "args": [[name], NOW]} for name in names]
+    times = np.asarray(motion.times)[frames]
     moving = NOW | {"fromcurrent": True, "frame": {"duration": 80, "redraw": True}}
     buttons = [
-        {"method": "animate", "label": "Play", "args": [None, moving]},
+        {
+            "method": "animate",
+            "label": "Play",
+            "args": [[names[i] for i in _evenly(times)], moving],
+        },
         {"method": "animate", "label": "Pause", "args": [[None], NOW]},
     ]
     return figure.update_layout(
@@ -237,6 +242,13 @@ def _figure(motion: Motion, colours: Mapping[str, str], budget: int) -> go.Figur
             {"type": "buttons", "direction": "left", "x": 0, "y": 1.1, "buttons": buttons}
         ],
     )
+
+
+def _evenly(times: np.ndarray) -> list[int]:
+    """Which frame is shown at even times: one before a gap for as long as that is."""
+    gap = np.median(np.diff(times)) if len(times) > 1 else 1.0
+    even = np.arange(times[0], times[-1] + gap / 2, gap)
+    return (np.searchsorted(times, even + gap / 2, side="right") - 1).tolist()
 
 
 def _look(motion: Motion, label: str, colour: str) -> dict:

@@ -107,6 +107,17 @@ def test_positions_of_a_motion_are_those_of_its_sheet_to_a_tenth_of_a_millimetre
         np.testing.assert_allclose(shown, 1e3 * x.reshape(-1, 3), atol=0.0501)
 
 
+def test_a_motion_plays_at_the_times_of_its_frames():
+    """Where two frames were dropped, the one before is shown three times as long."""
+    motion = made_up_motion(labels=LABELS)
+    times = 0.1 * np.array([0, 1, 2, 5, 6, 7])
+    (figure,) = figures.motion_figures([motion._replace(times=times)], colours_of(LABELS))
+    names = [frame.name for frame in figure.frames]
+    assert names[:4] == ["0.000 s", "0.100 s", "0.200 s", "0.500 s"]
+    played = figure.layout.updatemenus[0].buttons[0].args[0]
+    assert list(played) == [names[i] for i in (0, 1, 2, 2, 2, 3, 4, 5)]
+
+
 @pytest.mark.slow(group="study")
 def test_a_large_study_stays_within_the_limit(tmp_path):
     """Fifteen motions of twelve sheets of 13 x 13 vertices and 5,000 points in 120 frames."""
