@@ -101,6 +101,7 @@ class _Meshes(NamedTuple):
     - `problems_on`: the problems of the recordings on meshes of given shapes.
     - `coarsest`: the first of these.
     - `weights`: of the recordings, [1/m^2]; none: all frames have the same.
+    - `first`: of several recordings, the weighted search on the coarsest.
     """
 
     recordings: Recordings
@@ -108,6 +109,7 @@ class _Meshes(NamedTuple):
     run: Run
     coarsest: Shapes
     weights: Sequence[Array] = ()
+    first: Search | None = None
 
     def problems(self, shapes: Shapes) -> Problems:
         problems = self.problems_on(shapes)
@@ -131,8 +133,7 @@ class _Meshes(NamedTuple):
         begin on the coarsest mesh, where they take a quarter of the time."""
         end = self.search(search.shapes, search.theta, leads_on=False)
         end = end._replace(unsure=search.unsure)
-        is_single = len(self.recordings) == 1 or search.shapes == self.coarsest
-        return look_again(end, self.run, None if is_single else self.problems(self.coarsest))
+        return look_again(end, self.run, None if search.shapes == self.coarsest else self.first)
 
 
 def _first(meshes: _Meshes, shapes: Shapes, leads_on: bool) -> tuple[_Meshes, Search]:
@@ -142,7 +143,8 @@ def _first(meshes: _Meshes, shapes: Shapes, leads_on: bool) -> tuple[_Meshes, Se
         return meshes, search
     alone = each_alone(search.problems, meshes.run, search.theta, "alone")
     meshes = meshes._replace(weights=weights(alone))
-    return meshes, meshes.search(shapes, search.theta, leads_on)
+    first = meshes.search(shapes, search.theta, leads_on)
+    return meshes._replace(first=first), first
 
 
 def _refined(
@@ -182,7 +184,7 @@ def _continued(before: Search, finer: Search, run: Run) -> Search:
     return finer._replace(reached=before.reached, others=before.others, unsure=unsure)
 
 
-def look_again(search: Search, run: Run, coarse: Problems | None = None) -> Search:
+def look_again(search: Search, run: Run, coarse: Search | None = None) -> Search:
     """The best of a search and of others from samples of the prior, with how many fit as well.
 
     There is a third search where the first two differ. All losses count the same points, by the
@@ -190,25 +192,14 @@ def look_again(search: Search, run: Run, coarse: Problems | None = None) -> Sear
     standard errors (`others`). A search that leads to the first one's end ends there; one that
     diverges counts as one that ended elsewhere.
 
-    - `coarse`: the same recordings on a coarser mesh, on which the other searches begin; None: they
-      begin on the mesh of the first.
+    - `coarse`: that on a coarser mesh from which the first came. The others begin there; None: on
+      the mesh of the first.
     """
     problems, ends, losses, count, close = search.problems, [search], [0.0], 1, 0
-    one = {"num_samples": 0, "num_starts": 1, "warm_start": False, "is_intermediate": True}
-    again = run._replace(budget=run.budget._replace(**one))
     while count < MOST and close < 2:
-        start = _sample(problems[0].space, jr.fold_in(run.key, count))
         count += 1
-        words = f"search {count}, from another start"
-        own = again.beside(f".search{count}.npz")
         try:
-            if coarse is not None:
-                start = multi_start(coarse, own, start=start, words=words).theta
-                own = run.near(is_intermediate=True).beside(f".search{count}.end.npz")
-            own = own._replace(known=search.best)
-            end = multi_start(problems, own, start=start, words=words)
-            is_known = leads_to(problems, end.best, search.best)
-            ends.append(end._replace(rows=search.rows) if is_known else end)
+            ends.append(_from_another_start(search, run, coarse, count))
         except Diverged:
             tell(run.progress, f"search {count} diverged")
         losses = _losses(ends, run)
@@ -229,6 +220,24 @@ def look_again(search: Search, run: Run, coarse: Problems | None = None) -> Sear
         unsure=unsure if close > 1 else alone,
         shapes=search.shapes,
     )
+
+
+def _from_another_start(search: Search, run: Run, coarse: Search | None, number: int) -> Search:
+    """Another search, that of some `number`; the first, with the time of this, where it leads to
+    its end."""
+    words, seconds = f"search {number}, from another start", 0.0
+    start = _sample(search.problems[0].space, jr.fold_in(run.key, number - 1))
+    one = {"num_samples": 0, "num_starts": 1, "warm_start": False, "is_intermediate": True}
+    again = run._replace(budget=run.budget._replace(**one)).beside(f".search{number}.npz")
+    end = run.near(is_intermediate=True).beside(f".search{number}.end.npz")
+    steps = [(search, again)] if coarse is None else [(coarse, again), (search, end)]
+    for known, own in steps:
+        problems, own = known.problems, own._replace(known=known.best)
+        found = multi_start(problems, own, start=start, words=words)
+        start, seconds = found.theta, seconds + found.seconds
+        if leads_to(problems, found.best, known.best):
+            return search._replace(seconds=seconds)
+    return found._replace(seconds=seconds)
 
 
 def _sample(space: ParameterSpace, key: PRNGKeyArray) -> Float[Array, " dim"]:

@@ -221,7 +221,7 @@ def test_a_killed_look_at_other_starts_resumes(monkeypatch, tmp_path):
 
     monkeypatch.setattr(mesh_refinement, "multi_start", search)
     run = by_place(monkeypatch)[0]._replace(checkpoint=tmp_path / "state.npz")
-    look_again(ended(0.6), run, coarse=(Stub(),))  # pyright: ignore
+    look_again(ended(0.6), run, coarse=ended(0.9))
     assert len(files) == 5 == len(set(files))  # two searches on two meshes, and the end of the best
     forget(tmp_path / "state.npz")
     assert not list(tmp_path.iterdir())
@@ -254,6 +254,24 @@ def test_a_search_that_leads_to_the_first_end_confirms_it(monkeypatch):
     found = look_again(first, run)
     assert found.reached == (2, 2) and float(found.theta[0]) == pytest.approx(0.3)
     assert found.seconds == 2.0
+
+
+def test_a_search_that_leads_to_the_known_end_of_a_coarser_mesh_is_not_made_on_the_finer(
+    monkeypatch,
+):
+    by_place(monkeypatch)
+    first, coarse, made = ended(0.3), ended(0.4), []
+
+    def search(problems, run, *, start, words):
+        made.append(run.known)
+        return ended(0.36)
+
+    monkeypatch.setattr(mesh_refinement, "multi_start", search)
+    run = by_place(monkeypatch)[0]
+    monkeypatch.setattr(mesh_refinement, "leads_to", lambda _, end, known: known is coarse.best)
+    found = look_again(first, run, coarse)
+    assert found.reached == (2, 2) and float(found.theta[0]) == pytest.approx(0.3)
+    assert made == [coarse.best]
 
 
 def test_an_end_that_fits_nearly_as_well_is_in_the_errors_though_it_confirms_nothing(monkeypatch):
