@@ -1,6 +1,7 @@
 """Whether recordings are consistent with each other, and each with the estimate.
 
-`agreement`: a descent in each recording alone starts at the estimate. Its information beyond the
+`agreement`: the end of each recording alone is that by the derivative at the estimate
+(`by_slopes`); where by these they seem to differ, that of a descent. Its information beyond the
 prior is compared with that of the others: more scatter than standard errors allow means another
 fabric in one of them, or an error of its recorded conditions. (The covariance at the estimate would
 not show that: a misfit there counts as noise.) With a density ten times too large the stiffness
@@ -22,10 +23,24 @@ from scipy import special, stats
 
 from r2s.estimation.descent import Diverged, Run, multi_start
 from r2s.estimation.estimate import UNLIKELY, Agreement, Contradiction, Fit, Misfit
-from r2s.estimation.gauss_newton import Descent, held_back, prior_weight
-from r2s.estimation.least_squares import common_axes
+from r2s.estimation.gauss_newton import (
+    Descent,
+    held_back,
+    normal_from,
+    prior_terms,
+    prior_weight,
+    room,
+)
+from r2s.estimation.least_squares import bounded_step, common_axes
 from r2s.estimation.normal_equations import marker_distances, point_distances
-from r2s.estimation.prediction import Prediction, Theta, free_nuisances, remembering
+from r2s.estimation.prediction import (
+    Predicted,
+    Prediction,
+    Theta,
+    free_nuisances,
+    in_proportion,
+    remembering,
+)
 from r2s.estimation.problem import Problem, Problems
 from r2s.estimation.standard_errors import sandwich_of
 from r2s.metrics.losses import robust_weight
@@ -34,6 +49,7 @@ from r2s.metrics.losses import robust_weight
 # Lifts on 17 x 17 vertices err in warp, weft and shear by 0.10, root mean square (version 0.3.0);
 # with that, a density ten times off is doubted less often.
 MOST = 0.08
+STEPS, SURE = 4, 0.05  # of `by_slopes`; p-value by these from which on no descents are needed
 # parameters in proportion to the density, where no force is measured
 SCALED = ("warp", "weft", "shear", "bending", "E h")
 LOOSE = math.log(30.0)  # standard deviation of the logarithm of a wrong density
@@ -48,6 +64,25 @@ LITTLE = 0.25  # weight of a residual beyond the scale: below, it is an outlier
 
 Vector = Float[np.ndarray, " dim"]
 Matrix = Float[np.ndarray, "dim dim"]
+
+
+def by_slopes(problem: Problem, theta: Theta, predicted: Predicted, scale: Array) -> Descent:
+    """The end of a descent in a recording alone, did its motion change in proportion to theta.
+
+    - `predicted`: at `theta`, with its derivative. `scale`: of the robust loss, [m].
+    """
+    only, at = (problem,), theta
+    for left in reversed(range(STEPS + 1)):
+        normal = normal_from(only, at, [in_proportion(predicted[0], at - theta)], scale)
+        if not left:
+            break
+        prior = float(prior_weight(only, normal))
+        off, precision = (np.asarray(part, np.float64) for part in prior_terms(only, at))
+        slope = np.asarray(normal.gradient, np.float64) + prior * precision @ off
+        matrix = np.asarray(normal.matrix, np.float64) + prior * precision
+        at = at + jnp.asarray(bounded_step(slope, matrix, room(only, at)), at.dtype)
+    zero = jnp.zeros((), float)
+    return Descent(at, normal, zero, zero, jnp.asarray(scale, float), jnp.zeros((), int))
 
 
 class Information(NamedTuple):
@@ -115,6 +150,11 @@ def agreement(
     )
     named = Contradiction(odd, bound.name, float(apart[most]), (first, second))
     return agreed._replace(contradiction=named)
+
+
+def is_sure(agreed: Agreement) -> bool:
+    """Whether recordings agree so well `by_slopes` that no descents are needed."""
+    return agreed.p >= SURE and not agreed.doubts_density
 
 
 def information_of(

@@ -6,6 +6,7 @@
 import dataclasses
 import inspect
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -27,7 +28,7 @@ from r2s.estimation.descent import (
     multi_start,
     stacked,
 )
-from r2s.estimation.estimate import Estimate
+from r2s.estimation.estimate import Agreement, Estimate
 from r2s.estimation.gauss_newton import (
     MARGIN,
     Descent,
@@ -39,7 +40,9 @@ from r2s.estimation.gauss_newton import (
 )
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import (
-    derivatives_at,
+    Predicted,
+    Prediction,
+    Theta,
     explain,
     fabric_at,
     nuisances,
@@ -102,6 +105,7 @@ def with_uncertainty(
     predicted = run.derive(problems, best.theta, width)
     predictions = [prediction for prediction, _ in predicted]
     coarse, beside = standard_errors.coarser_of(problems, other_mesh)
+    moved = () if other_mesh is None else standard_errors.predicted_on(other_mesh, best)
     key = jax.random.fold_in(run.key, 1)
     covariance = covariance_at(problems, run.budget, best, key, tried_on=coarse, derive=run.derive)
     if search.others:  # that fit nearly as well
@@ -110,7 +114,7 @@ def with_uncertainty(
     of_law, bias = standard_errors.model_error(problems, best, prior, predicted), None
     covariance = covariance + np.outer(of_law, of_law)
     if other_mesh is not None:
-        error = mesh_error(problems, other_mesh, best, predicted)
+        error = mesh_error(problems, other_mesh, best, predicted, moved)
         theta, covariance, bias = standard_errors.with_mesh_error(
             problems, other_mesh, best, prior, covariance, error
         )
@@ -124,18 +128,9 @@ def with_uncertainty(
         unsure = search.unsure or (STUCK if is_stuck(search) else "")
     loss = loss_from(problems, predictions)
     estimate = _collected(problems, best, search.rows, covariance, approach, loss, bias)
-    try:
-        alone = each_alone(coarse, run, best.theta, "checked")
-    except Diverged:  # on the coarser mesh, of a fabric of the finer one
-        tell(run.progress, "a recording alone diverged: not compared")
-        alone = []
-    agreed = None
-    if alone:
-        biases = [
-            mesh_error((problem,), other, end, run.derive((problem,), end.theta, width))[0]
-            for problem, other, end in zip(coarse, beside, alone, strict=False)
-        ]
-        agreed = consistency.agreement(coarse, alone, biases)
+    agreed = _by_slopes(problems, search.best, predicted, other_mesh, moved)
+    if agreed is not None and not consistency.is_sure(agreed):
+        agreed = _by_descents(coarse, beside, run, best.theta)
     misfits = consistency.misfits(problems, best.theta, predictions)
     if consistency.asks_for_density(problems, agreed, misfits):
         agreed = consistency.with_density(agreed, coarse, run, best.theta)
@@ -144,12 +139,58 @@ def with_uncertainty(
         seconds=seconds,
         converged=has_arrived(search) and not unsure,
         agreement=agreed,
-        shares=tuple(float(share) for share in recording_weights(problems)) if alone else (),
+        shares=tuple(float(share) for share in recording_weights(problems))
+        if len(problems) > 1
+        else (),
         misfits=misfits,
         fits=consistency.fits(problems, predictions, float(best.scale)),
         reached=search.reached,
         unsure=unsure,
     )
+
+
+def _by_slopes(
+    problems: Problems,
+    end: Descent,
+    predicted: Predicted,
+    other_mesh: OtherMesh | None,
+    moved: Sequence[Prediction],
+) -> Agreement | None:
+    """Whether several recordings agree, by the derivative of each at the end of all.
+
+    - `predicted`, `moved`: there, on this mesh and another.
+    """
+    if len(problems) < 2:
+        return None
+    ends, biases = [], []
+    for which, (problem, pair) in enumerate(zip(problems, predicted, strict=True)):
+        own = end.theta[theta_indices(problems, which)]
+        ends.append(consistency.by_slopes(problem, own, [pair], end.scale))
+        if other_mesh is not None:
+            other = OtherMesh((other_mesh.problems[which],), other_mesh.factor)
+            here = dataclasses.replace(end, theta=own)
+            biases.append(mesh_error((problem,), other, here, [pair], moved[which : which + 1])[0])
+    return consistency.agreement(problems, ends, biases)
+
+
+def _by_descents(
+    problems: Problems, others: Sequence[OtherMesh], run: Run, theta: Theta
+) -> Agreement | None:
+    """Whether several recordings agree, by a descent in each alone from a theta of all.
+
+    - `others`: each recording on another mesh.
+    """
+    try:
+        ends = each_alone(problems, run, theta, "checked")
+    except Diverged:  # on the coarser mesh, of a fabric of the finer one
+        tell(run.progress, "a recording alone diverged: not compared")
+        return None
+    width = run.budget.secant_width
+    biases = [
+        mesh_error((problem,), other, end, run.derive((problem,), end.theta, width))[0]
+        for problem, other, end in zip(problems, others, ends, strict=False)
+    ]
+    return consistency.agreement(problems, ends, biases)
 
 
 def _collected(
@@ -198,14 +239,17 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     place = jnp.clip(space.to_unit(fabric), MARGIN, 1 - MARGIN)
     theta = jnp.concatenate([place, jnp.zeros(theta_length(problems) - space.dim, float)])
     scale = jnp.asarray(NOISE, float)
-    predicted = derivatives_at(problems, theta)
+    derive = remembering()
+    predicted = derive(problems, theta, None)
     normal = normal_from(problems, theta, predicted, scale)
     if not np.isfinite(float(normal.loss)):
         why = explain(problems[0], theta[theta_indices(problems, 0)])
         raise RuntimeError(f"the simulation of the motion {why or 'has a loss that is not finite'}")
     zero = jnp.zeros((), float)
     end = Descent(theta, normal, zero, zero, scale, jnp.zeros((), int))
-    covariance = covariance_at(problems, DEFAULT, end, jax.random.key(0), is_truth=True)
+    covariance = covariance_at(
+        problems, DEFAULT, end, jax.random.key(0), is_truth=True, derive=derive
+    )
     loss = loss_from(problems, [prediction for prediction, _ in predicted])
     return _collected(problems, end, [[end]], covariance, "sensitivity", loss)
 

@@ -313,6 +313,8 @@ def _problems(recordings: Recordings, space: ParameterSpace, shapes: Shapes) -> 
     for recording, shape in zip(recordings, shapes, strict=True):
         problem = Problem.make(recording, space, shape=shape)
         scenario = in_mesh_steps(problem.scenario, recording.info.scenario, shape)
+        if _is_taut(recording) and scenario.turn is None:  # pulls at all angles are one program
+            scenario = dataclasses.replace(scenario, turn=jnp.zeros((), float))
         problems.append(dataclasses.replace(problem, scenario=scenario))
     return tuple(problems)
 

@@ -104,6 +104,16 @@ class Sensitivity(eqx.Module):
     force: Float[Array, "frame direction theta"] | None
 
 
+def in_proportion(
+    predicted: tuple[Prediction, Sensitivity], change: Theta
+) -> tuple[Prediction, Sensitivity]:
+    """What a prediction would be after a change of theta, were its derivative the same."""
+    there, slope = predicted
+    parts = (there.x, there.force), (slope.x, slope.force)
+    x, force = jax.tree.map(lambda at, by: at + by @ change, *parts)
+    return Prediction(x, force, there.ok), slope
+
+
 Predicted = list[tuple[Prediction, Sensitivity]]  # of each recording
 Derive = Callable[[Problems, Theta, float | None], Predicted]  # as `derivatives_at`
 

@@ -11,6 +11,7 @@ estimate's mesh, interpolated to the other's vertices. The step is extrapolated 
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -41,9 +42,11 @@ from r2s.estimation.normal_equations import normal_equations_of
 from r2s.estimation.prediction import (
     Derive,
     Predicted,
+    Prediction,
     Sensitivity,
     Theta,
     derivatives_at,
+    in_proportion,
     predict_compiled,
     predictions_at,
     theta_indices,
@@ -157,18 +160,36 @@ def covariance_at(
     - `tried_on`: the same recordings on the mesh of the neighbours, one standard error of that mesh
       away; None: the mesh of the descent.
     """
-    other, start = tried_on or problems, end
+    other, start, width = tried_on or problems, end, budget.secant_width
     if other is not problems:
-        predicted = derive(other, end.theta, budget.secant_width)
+        predicted = derive(other, end.theta, width)
         start = dataclasses.replace(end, normal=normal_from(other, end.theta, predicted, end.scale))
     apart = jnp.zeros((0, len(end.theta)), float)
     if budget.num_probes:
         weight = prior_weight(other, start.normal)
         places = list(sample_around(other, start, weight, budget.num_probes, key))
-        normals = normals_at(other, places, [end.scale] * len(places), budget.secant_width)
+        near = _smooth_pulls(end.theta, derive(other, end.theta, width))
+        normals = normals_at(other, places, [end.scale] * len(places), width, near)
         apart = steps_apart(other, start, weight, list(zip(places, normals, strict=True)))
     prior = prior_weight(problems, end.normal)
     return np.asarray(covariance(problems, end, prior, apart, is_truth))
+
+
+def _smooth_pulls(theta: Theta, predicted: Predicted) -> Derive:
+    """`derivatives_at` places around a theta, at which all is `predicted`: pulls change there in
+    proportion, since a taut sheet does not buckle."""
+
+    def derive(problems: Problems, place: Theta, width: float | None = None) -> Predicted:
+        found = []
+        for which, (problem, there) in enumerate(zip(problems, predicted, strict=True)):
+            index = theta_indices(problems, which)
+            if problem.is_pulled:
+                found.append(in_proportion(there, (place - theta)[index]))
+            else:
+                found += derivatives_at((problem,), place[index], width)
+        return found
+
+    return derive
 
 
 def to_small_strain(
@@ -266,7 +287,11 @@ def coarser_of(
 
 
 def mesh_error(
-    problems: Problems, other: OtherMesh, end: Descent, predicted: Predicted
+    problems: Problems,
+    other: OtherMesh,
+    end: Descent,
+    predicted: Predicted,
+    moved: Sequence[Prediction] = (),
 ) -> tuple[Vector, Matrix]:
     """The discretization error of theta, by one Gauss-Newton step: its bias from the limit of fine
     meshes; and the square of that with its scatter between patches and blocks of frames.
@@ -277,16 +302,15 @@ def mesh_error(
     there. Where a motion fails, or the step is longer than the range, it is the whole range.
 
     - `predicted`: at the end, with its derivative.
+    - `moved`: the predictions on the other mesh, where they are known.
     """
-    size = theta_length(problems)
+    size, moved = theta_length(problems), moved or predicted_on(other, end)
     changes, matrix, square = [], np.zeros((size, size)), 0.0
     for which, share in enumerate(recording_weights(problems)):
         index = theta_indices(problems, which)
-        own, finer, theta = problems[which], other.problems[which], end.theta[index]
-        prediction, slope = predicted[which]
-        moved = predict_compiled(motion_alone(finer), theta)
+        own, finer, (prediction, slope) = problems[which], other.problems[which], predicted[which]
         before = equations(own, prediction, slope, end.scale)
-        after = equations(finer, moved, _laid_onto(own, finer, slope), end.scale)
+        after = equations(finer, moved[which], _laid_onto(own, finer, slope), end.scale)
         change = np.zeros((len(before.scores), size))
         change[:, index] = share * (np.asarray(after.scores) - np.asarray(before.scores))
         changes.append(change)
@@ -301,6 +325,13 @@ def mesh_error(
     bias = np.clip(bias, -1, 1)
     apart = other.factor * change @ np.linalg.inv(matrix)
     return bias, np.outer(bias, bias) + apart.T @ apart
+
+
+def predicted_on(other: OtherMesh, end: Descent) -> list[Prediction]:
+    """The predictions of all recordings on another mesh, one after the other: they are large."""
+    pairs = enumerate(other.problems)
+    indices = [(p, jnp.asarray(theta_indices(other.problems, i))) for i, p in pairs]
+    return [predict_compiled(motion_alone(p), end.theta[index]) for p, index in indices]
 
 
 def _laid_onto(own: Problem, other: Problem, slope: Sensitivity) -> Sensitivity:

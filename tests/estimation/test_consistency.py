@@ -16,9 +16,11 @@ from r2s.estimation.consistency import (
     Information,
     agreement,
     asks_for_density,
+    by_slopes,
     density_of,
     fits,
     information_of,
+    is_sure,
     misfits,
     outlier,
     scatter_of,
@@ -26,8 +28,15 @@ from r2s.estimation.consistency import (
 from r2s.estimation.descent import DEFAULT, Run, each_alone
 from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Fit, Misfit, point_estimate
 from r2s.estimation.methods import DiffCloud
-from r2s.estimation.prediction import predict, remembering, theta_length
+from r2s.estimation.prediction import (
+    derivatives_at,
+    predict,
+    remembering,
+    theta_indices,
+    theta_length,
+)
 from r2s.estimation.problem import NuisancePrior, Problem
+from r2s.estimation.standard_errors import _smooth_pulls
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
@@ -67,6 +76,16 @@ def judged(problems, place):
     return agreement(problems, ends_of(problems, place))
 
 
+def stepped(problems, place):
+    """The agreement by the slopes of each a place that is right for the first."""
+    theta = jnp.zeros(theta_length(problems), float).at[: len(place)].set(place)
+    predicted, ends = derivatives_at(problems, theta), []
+    for which, problem in enumerate(problems):
+        own = theta[theta_indices(problems, which)]
+        ends.append(by_slopes(problem, own, [predicted[which]], jnp.asarray(STRICT)))
+    return agreement(problems, ends)
+
+
 @pytest.mark.slow(group="estimates")
 def test_recordings_of_one_fabric_agree_and_that_of_another_is_named(lifts):
     first, second, other, place = lifts
@@ -79,6 +98,10 @@ def test_recordings_of_one_fabric_agree_and_that_of_another_is_named(lifts):
     assert odd is not None and odd.recording == 1
     assert odd.parameter in ("warp", "weft", "shear") and odd.errors > 3
     assert odd.values[0] == pytest.approx(3 * odd.values[1], rel=0.3)
+    # slopes see that there is nothing to look for, or that there is
+    by_steps = stepped((first, second), place), stepped((first, other, second), place)
+    assert all(each is not None for each in by_steps)
+    assert [is_sure(each) for each in by_steps if each is not None] == [True, False]
 
 
 @pytest.mark.slow(group="estimates")
@@ -224,6 +247,21 @@ def test_what_fits_is_not_named_and_points_of_another_thing_are_counted(pulled, 
     problem = problem_of(dataclasses.replace(lifted, points=jnp.asarray(points)))
     (fit,) = fits((problem,), at_truth(problem)[1], STRICT)
     assert fit.outliers == pytest.approx(mask[:, ::5].sum() / mask.sum(), abs=0.05)
+
+
+def test_a_pull_changes_in_proportion_within_its_errors(pulled):
+    """So that places around the end of an estimate need no motions of pulls."""
+    problems = (problem_of(pulled),)
+    theta, _ = at_truth(problems[0])
+    there = derivatives_at(problems, theta)
+    place = theta.at[: SPACE.dim].add(0.01 * jnp.array([1.0, -1, 1, -1, 1, -1, 1]))
+    ((exact, _),) = derivatives_at(problems, place)
+    ((near, slope),) = _smooth_pulls(theta, there)(problems, place, None)
+    assert slope is there[0][1]
+    for name in ("x", "force"):
+        before, moved, said = (np.asarray(getattr(p, name)) for p in (there[0][0], exact, near))
+        change = np.linalg.norm(moved - before)
+        assert change > 0 and np.linalg.norm(said - moved) < 0.1 * change
 
 
 def test_a_marker_on_another_cloth_or_lost_by_the_tracker_is_named(pulled):
