@@ -114,7 +114,7 @@ def test_what_the_readme_says_runs_where_only_a_wheel_is_installed(tmp_path: Pat
     subprocess.run([sys.executable, "-m", "venv", environment], check=True)
     binaries = environment / "bin"
     python = binaries / "python"
-    extras = f"{wheel}[study,camera,cli]"
+    extras = f"{wheel}[study,camera,cli,viz]"
     install = [python, "-m", "pip", "install", "-q", extras, "-c", ROOT / "constraints.txt"]
     subprocess.run(install, check=True, cwd=tmp_path)
     ours = os.environ | {"PATH": f"{binaries}:{os.environ['PATH']}", "JAX_PLATFORMS": "cpu"}
