@@ -27,11 +27,10 @@ from r2s.estimation.gauss_newton import (
     Descent,
     held_back,
     normal_from,
-    prior_terms,
     prior_weight,
-    room,
+    propose,
 )
-from r2s.estimation.least_squares import bounded_step, common_axes
+from r2s.estimation.least_squares import common_axes
 from r2s.estimation.normal_equations import marker_distances, point_distances
 from r2s.estimation.prediction import (
     Predicted,
@@ -71,18 +70,16 @@ def by_slopes(problem: Problem, theta: Theta, predicted: Predicted, scale: Array
 
     - `predicted`: at `theta`, with its derivative. `scale`: of the robust loss, [m].
     """
-    only, at = (problem,), theta
-    for left in reversed(range(STEPS + 1)):
-        normal = normal_from(only, at, [in_proportion(predicted[0], at - theta)], scale)
-        if not left:
-            break
-        prior = float(prior_weight(only, normal))
-        off, precision = (np.asarray(part, np.float64) for part in prior_terms(only, at))
-        slope = np.asarray(normal.gradient, np.float64) + prior * precision @ off
-        matrix = np.asarray(normal.matrix, np.float64) + prior * precision
-        at = at + jnp.asarray(bounded_step(slope, matrix, room(only, at)), at.dtype)
-    zero = jnp.zeros((), float)
-    return Descent(at, normal, zero, zero, jnp.asarray(scale, float), jnp.zeros((), int))
+    only, zero = (problem,), jnp.zeros((), float)
+
+    def at(place: Theta) -> Descent:
+        normal = normal_from(only, place, [in_proportion(predicted[0], place - theta)], scale)
+        return Descent(place, normal, zero, zero, jnp.asarray(scale, float), zero.astype(int))
+
+    end = at(theta)
+    for _ in range(STEPS):
+        end = at(propose(only, end, prior_weight(only, end.normal)))  # without damping
+    return end
 
 
 class Information(NamedTuple):

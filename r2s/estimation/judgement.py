@@ -105,7 +105,7 @@ def with_uncertainty(
     predicted = run.derive(problems, best.theta, width)
     predictions = [prediction for prediction, _ in predicted]
     coarse, beside = standard_errors.coarser_of(problems, other_mesh)
-    moved = () if other_mesh is None else standard_errors.predicted_on(other_mesh, best)
+    moved = () if other_mesh is None else predictions_at(other_mesh.problems, best.theta)
     key = jax.random.fold_in(run.key, 1)
     covariance = covariance_at(problems, run.budget, best, key, tried_on=coarse, derive=run.derive)
     if search.others:  # that fit nearly as well
@@ -128,9 +128,9 @@ def with_uncertainty(
         unsure = search.unsure or (STUCK if is_stuck(search) else "")
     loss = loss_from(problems, predictions)
     estimate = _collected(problems, best, search.rows, covariance, approach, loss, bias)
-    agreed = _by_slopes(problems, search.best, predicted, other_mesh, moved)
+    agreed = _agreed_by_slopes(problems, search.best, predicted, other_mesh, moved)
     if agreed is not None and not consistency.is_sure(agreed):
-        agreed = _by_descents(coarse, beside, run, best.theta)
+        agreed = _agreed_by_descents(coarse, beside, run, best.theta)
     misfits = consistency.misfits(problems, best.theta, predictions)
     if consistency.asks_for_density(problems, agreed, misfits):
         agreed = consistency.with_density(agreed, coarse, run, best.theta)
@@ -149,7 +149,7 @@ def with_uncertainty(
     )
 
 
-def _by_slopes(
+def _agreed_by_slopes(
     problems: Problems,
     end: Descent,
     predicted: Predicted,
@@ -173,7 +173,7 @@ def _by_slopes(
     return consistency.agreement(problems, ends, biases)
 
 
-def _by_descents(
+def _agreed_by_descents(
     problems: Problems, others: Sequence[OtherMesh], run: Run, theta: Theta
 ) -> Agreement | None:
     """Whether several recordings agree, by a descent in each alone from a theta of all.

@@ -47,12 +47,11 @@ from r2s.estimation.prediction import (
     Theta,
     derivatives_at,
     in_proportion,
-    predict_compiled,
     predictions_at,
     theta_indices,
     theta_length,
 )
-from r2s.estimation.problem import Problem, Problems, motion_alone, seen_where
+from r2s.estimation.problem import Problem, Problems, seen_where
 from r2s.materials.parameters import InformedSpace, stiffens
 from r2s.mesh.surface import nearest
 from r2s.scenarios.resolution import ORDER
@@ -304,7 +303,7 @@ def mesh_error(
     - `predicted`: at the end, with its derivative.
     - `moved`: the predictions on the other mesh, where they are known.
     """
-    size, moved = theta_length(problems), moved or predicted_on(other, end)
+    size, moved = theta_length(problems), moved or predictions_at(other.problems, end.theta)
     changes, matrix, square = [], np.zeros((size, size)), 0.0
     for which, share in enumerate(recording_weights(problems)):
         index = theta_indices(problems, which)
@@ -325,13 +324,6 @@ def mesh_error(
     bias = np.clip(bias, -1, 1)
     apart = other.factor * change @ np.linalg.inv(matrix)
     return bias, np.outer(bias, bias) + apart.T @ apart
-
-
-def predicted_on(other: OtherMesh, end: Descent) -> list[Prediction]:
-    """The predictions of all recordings on another mesh, one after the other: they are large."""
-    pairs = enumerate(other.problems)
-    indices = [(p, jnp.asarray(theta_indices(other.problems, i))) for i, p in pairs]
-    return [predict_compiled(motion_alone(p), end.theta[index]) for p, index in indices]
 
 
 def _laid_onto(own: Problem, other: Problem, slope: Sensitivity) -> Sensitivity:
